@@ -222,6 +222,23 @@ def test_compose_is_as_in_production() -> None:
         assert services["coordinator"]["depends_on"][name]["condition"] == "service_healthy"
 
 
+def test_compose_follows_the_specification() -> None:
+    """By the schema of compose-spec, which check-jsonschema brings."""
+    command = [linter("check-jsonschema", "check-jsonschema"), "--builtin-schema"]
+    path = DEPLOY / "compose" / "compose.yaml"
+    done = subprocess.run([*command, "vendor.compose-spec", path], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_compose_limits_what_a_worker_takes_and_what_is_logged() -> None:
+    services = COMPOSE["services"]
+    limits = services["worker"]["deploy"]["resources"]["limits"]
+    assert limits == {"cpus": "${STICKSLIP_CPUS:-1}", "memory": "${STICKSLIP_MEMORY:-3g}"}
+    assert "--max-cpus=${STICKSLIP_CPUS:-1}" in services["worker"]["command"][0]
+    for name, service in services.items():
+        assert set(service["logging"]["options"]) == {"max-size", "max-file"}, name
+
+
 def test_compose_is_what_docker_takes() -> None:
     asked = ["docker", "compose", "version"]
     if shutil.which("docker") is None or subprocess.run(asked, capture_output=True).returncode != 0:

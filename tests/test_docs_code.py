@@ -33,7 +33,7 @@ LONG = {
     "benchmark.md",
 }  # clips of two simulations, 245 rods; the tutorials make smaller datasets
 # deploy/, PostgreSQL and S3 need other machines; test_deploy.py checks commands of the first
-MOST_SKIPPED = 32
+MOST_SKIPPED = 30
 
 _RUN = ("python", "sh", "yaml")
 _FENCE = re.compile(
@@ -82,12 +82,25 @@ def test_every_block_says_what_it_is(page: Path) -> None:
     )
 
 
+def runner_of(block: Block) -> Path | None:
+    """Return the test that runs a block in a place of its own; None if no test does."""
+    named = re.search(r"((?:services/)?tests/\w+\.py) runs it", block.reason or "")
+    return None if named is None else ROOT / named[1]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_blocks_that_run_elsewhere_name_a_test(page: Path) -> None:
+    for block in blocks(page):
+        runner = runner_of(block)
+        assert runner is None or runner.exists(), (page.name, block)
+
+
 def test_few_blocks_are_not_run() -> None:
     skipped = [
         (page.name, block.line, block.reason)
         for page in PAGES
         for block in blocks(page)
-        if block.reason
+        if block.reason and runner_of(block) is None
     ]
     assert len(skipped) <= MOST_SKIPPED, skipped
 

@@ -224,7 +224,9 @@ class Reason(StrEnum):
     stretch = "stretch"
     penetration = "penetration"
     passages = "passages"
+    friction_error = "friction_error"
     # The same, of rows that earlier versions wrote.
+    sharpness = "sharpness"
     missed = "missed"
     # Only jobs end or wait for these.
     cancelled = "cancelled"

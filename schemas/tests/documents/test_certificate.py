@@ -75,6 +75,10 @@ CONTRADICTIONS: dict[str, tuple[dict[str, Any], str]] = {
         document(protocols=[protocol(curves=off_by(0.02), error=0.02, passed=False)]),
         "all protocols passed",
     ),
+    "passed with a step that did not converge": (
+        document(protocols=[protocol(settings={"unconverged_steps": 1})]),
+        "all steps have converged",
+    ),
     "passed beyond the tolerance": (
         document(protocols=[protocol(curves=off_by(0.02), error=0.02)]),
         "within their tolerances",

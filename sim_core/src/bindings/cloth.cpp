@@ -92,7 +92,17 @@ void bind_cloth(nb::module_& m) {
       .def_ro("flow", &DiagnosticExtremes::flow,
               "Sum of the sizes of all changes of energy and of all work [J].")
       .def_ro("gain", &DiagnosticExtremes::gain,
-              "Largest energy gained beyond the work of all forces [J].");
+              "Largest energy gained beyond the work of all forces [J].")
+      .def_prop_ro(
+          "friction",
+          [](const DiagnosticExtremes& extremes) {
+            std::vector<std::pair<double, double>> out;
+            for (const FrictionWork& with : extremes.friction)
+              out.emplace_back(with.work, with.error);
+            return out;
+          },
+          "Work of friction with each body, then surface, then sheet, and the bound on its error "
+          "[J].");
   m.attr("radius_least") = radius_least;
   nb::class_<StepReport>(m, "StepReport", "How a step of cloth went, or several.")
       .def(nb::init<>())

@@ -5,6 +5,7 @@
 #include <array>
 #include <cstddef>
 #include <limits>
+#include <vector>
 
 namespace sim_core {
 
@@ -20,6 +21,12 @@ struct RungCount {
   int converged = 0;
 };
 
+// Of friction with one body, surface or sheet, J.
+struct FrictionWork {
+  double work = 0.0;   // of what slides
+  double error = 0.0;  // bound on the part of it by which cells may be wrong
+};
+
 // Worst values over the accepted steps, which the checks of a run judge, see checks.py.
 struct DiagnosticExtremes {
   double stretch = 0.0;  // largest principal stretch of a triangle at the end of a step
@@ -29,8 +36,9 @@ struct DiagnosticExtremes {
   double contact_work =
       0.0;            // J: of bodies on the cloth as it moves against them, where that is positive
   double flow = 0.0;  // J: sum of the sizes of all changes of energy and of all work
-  double balance = 0.0;  // J: energy gained beyond the work of all forces
-  double gain = 0.0;     // J: the largest `balance` at the end of a step
+  double balance = 0.0;                // J: energy gained beyond the work of all forces
+  double gain = 0.0;                   // J: the largest `balance` at the end of a step
+  std::vector<FrictionWork> friction;  // with each body, then each surface, then each sheet
 
   void add(const DiagnosticExtremes& next) {
     stretch = std::max(stretch, next.stretch);
@@ -40,6 +48,11 @@ struct DiagnosticExtremes {
     flow += next.flow;
     gain = std::max(gain, balance + next.gain);
     balance += next.balance;
+    if (friction.size() < next.friction.size()) friction.resize(next.friction.size());
+    for (std::size_t other = 0; other < next.friction.size(); ++other) {
+      friction[other].work += next.friction[other].work;
+      friction[other].error += next.friction[other].error;
+    }
   }
 };
 

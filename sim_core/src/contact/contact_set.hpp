@@ -118,6 +118,9 @@ class ContactSet {
   // into forces.
   void count_errors(double stiffness, ForceNorms& norms) const;
 
+  // By how much a pair's vector rho turns in the step: with a body or surface, or half with each
+  // sheet.
+  Eigen::Matrix3d turn_of(const Candidate& stencil, const Eigen::Vector4d& weights);
   // Whether a pair is active, or cloth is near cloth: idle pairs with surfaces do not count.
   bool relevant() const;
   // Whether there is a force or an active pair.
@@ -147,7 +150,7 @@ class ContactSet {
   void linearize_at(const Buffer<double>& x);
 
   // A triangle whose closest point to a vertex lies on this feature.
-  struct Found {
+  struct NearFeature {
     int feature;
     const Candidate* candidate;
     Eigen::Vector4d weights;
@@ -160,7 +163,7 @@ class ContactSet {
   const Buffer<double>*start_ = nullptr, *ends_ = nullptr;
   Turns turns_;
   std::vector<Eigen::Matrix3d> own_;
-  std::vector<Found> found_;                     // of the vertex at hand
+  std::vector<NearFeature> near_features_;       // of the vertex at hand
   std::vector<Pair> pairs_;                      // sorted by kind, first, feature
   std::vector<PairPast> base_, history_, best_;  // likewise
   std::vector<int> nodes_;                       // of `rows`

@@ -126,25 +126,26 @@ void ContactSet::find_vertices(std::vector<Candidate>& candidates, double range,
 // where all triangles around the feature agree: else a point inside one of them is closer.
 void ContactSet::find_vertex(std::span<Candidate> candidates, double reach,
                              const Buffer<double>& x) {
-  std::vector<Found>& found = found_;
-  found.clear();
+  std::vector<NearFeature>& near_features = near_features_;
+  near_features.clear();
   for (Candidate& stencil : candidates) {
     if (stencil.distance > reach) continue;
     const FourPoints at = points_of(stencil, x);
     const Vector4d weights = closest_weights(stencil.kind, at);
     stencil.distance = between_closest(weights, at).norm();
-    found.push_back({feature_of(stencil, weights), &stencil, weights});
+    near_features.push_back({feature_of(stencil, weights), &stencil, weights});
   }
-  std::sort(found.begin(), found.end(), [](const Found& a, const Found& b) {
-    return a.feature != b.feature ? a.feature < b.feature : a.candidate < b.candidate;
-  });
-  for (std::size_t i = 0, next = 0; i < found.size(); i = next) {
-    const int feature = found[i].feature;
-    while (next < found.size() && found[next].feature == feature) ++next;
-    const Candidate& stencil = *found[i].candidate;
+  std::sort(near_features.begin(), near_features.end(),
+            [](const NearFeature& a, const NearFeature& b) {
+              return a.feature != b.feature ? a.feature < b.feature : a.candidate < b.candidate;
+            });
+  for (std::size_t i = 0, next = 0; i < near_features.size(); i = next) {
+    const int feature = near_features[i].feature;
+    while (next < near_features.size() && near_features[next].feature == feature) ++next;
+    const Candidate& stencil = *near_features[i].candidate;
     const bool agree = static_cast<int>(next - i) == triangles_around(feature);
     if (!agree || stencil.distance > reach || has_reverse(stencil.first, feature)) continue;
-    add(stencil, feature, found[i].weights, x);
+    add(stencil, feature, near_features[i].weights, x);
   }
 }
 
@@ -219,9 +220,12 @@ void ContactSet::add(const Candidate& stencil, int feature, const Vector4d& weig
                     given});
 }
 
-// Motion of the first point over the second, less that by which rho turns: with a surface,
-// or half with each sheet.
+// Motion of the first point over the second, less that by which rho turns.
 Vector3d ContactSet::slip(const Candidate& stencil, const Vector4d& weights, const Vector3d& rho) {
+  return rho - turn_of(stencil, weights) * between_closest(weights, points_of(stencil, *start_));
+}
+
+Matrix3d ContactSet::turn_of(const Candidate& stencil, const Vector4d& weights) {
   const std::vector<int>& sheet_of_node = near.surface.sheet_of_node;
   const int a = sheet_of_node[stencil.node[0]], b = sheet_of_node[stencil.node[3]];
   Matrix3d turn = Matrix3d::Zero();
@@ -231,7 +235,7 @@ Vector3d ContactSet::slip(const Candidate& stencil, const Vector4d& weights, con
     if (share * weights[c] != 0.0)
       turn += share * std::abs(weights[c]) * turns_.of(near.surface, stencil.node[c]);
   }
-  return rho - turn * between_closest(weights, points_of(stencil, *start_));
+  return turn;
 }
 
 }  // namespace sim_core

@@ -133,5 +133,5 @@ def test_the_reason_is_the_cause_and_not_what_follows() -> None:
     good = dict(checks.values(checks.Seen(cloth, cloth.positions[None], 0)))
     assert checks.failed({**good, "stretch": 6.4, "penetration": 6.4})[0] == "penetration"
     assert checks.failed({**good, "stretch": 6.4, "passages": 1.0})[0] == "passages"
-    assert checks.failed({**good, "stretch": 2.9, "missed": 1.0})[0] == "stretch"
+    assert checks.failed({**good, "stretch": 2.9, "friction_error": 0.5})[0] == "stretch"
     assert checks.failed({**good, "missed": 1.0})[0] == "", "recorded, and not judged"

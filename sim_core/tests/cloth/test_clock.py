@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 
 from stickslip_sim_core import Body, Cloth, SolverSettings, box, fabric, plane, preset_named, sphere
 from stickslip_sim_core.arrays import Floats
@@ -147,6 +148,42 @@ def test_jumps_are_not_valid(far: float, preset: SolverSettings) -> None:
         0
     ]
     assert checks.failed(checks.values(checks.Seen(jumps, jumps.positions[None], 0)))[0] == "jumps"
+
+
+@pytest.mark.physics
+@pytest.mark.parametrize(
+    ("stop", "jump", "code"),
+    [
+        (0.47, 0.0, ""),  # with the last frame, within a step: what follows is not shown
+        (0.45, 0.0, "jumps"),
+        (0.47, 0.01, "jumps"),  # which the last frame shows
+    ],
+)
+def test_what_happens_after_the_last_frame_is_not_judged(
+    stop: float, jump: float, code: str
+) -> None:
+    """A holder that stops at once from 0.8 m/s, and may jump as it does."""
+
+    def pose(time: ArrayLike) -> Floats:
+        at = np.asarray(time, float)
+        place = 0.8 * np.minimum(at, stop) + jump * (at >= stop)
+        poses: Floats = np.eye(3, 4) + np.eye(1, 12, 3).reshape(3, 4) * place[..., None, None]
+        return poses
+
+    start = np.column_stack([np.zeros(len(STRIP.rest)), STRIP.rest])
+    gravity = np.tile([0.0, 0.0, -GRAVITY], (len(start), 1))
+    run = Scene(
+        mesh=STRIP,
+        fabrics=[MATERIAL],
+        preset=CERTIFIED,
+        start=start,
+        motion=lambda _: (gravity, []),
+        holders=[Holder(TOP, pose)],
+        frames=48,
+        frame_rate=100.0,
+    ).run()
+    assert run.times[-1] == 0.47
+    assert run.code == code
 
 
 @pytest.mark.physics

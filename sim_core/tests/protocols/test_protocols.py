@@ -163,6 +163,11 @@ class TestResult:
         assert self.RESULT.passed
         assert not replace(self.RESULT, tolerance=0.05).passed
 
+    def test_a_step_that_did_not_converge_fails(self) -> None:
+        """Also where the errors are small: a step above the tolerance is no measurement."""
+        assert replace(self.RESULT, settings={"unconverged_steps": 0}).passed
+        assert not replace(self.RESULT, settings={"unconverged_steps": 1}).passed
+
     def test_missing_measurement_fails(self) -> None:
         one_sided = Curve({}, (1.0,), (math.nan,), (1.0,))
         result = replace(self.RESULT, curves=(one_sided,))

@@ -35,7 +35,7 @@ _SECTIONS = {
     "Scenes": dict.fromkeys(("scene", "simulate"), "specs"),
     "Certificates": dict.fromkeys(("certify", "register", "certificates"), "workers"),
     "Administration": dict.fromkeys(("keys", "projects", "webhooks", "audit-log"), "admin"),
-    "Maintenance": dict.fromkeys(("rm", "gc", "reindex", "scrub"), "maintenance"),
+    "Maintenance": dict.fromkeys(("backup", "rm", "gc", "reindex", "scrub"), "maintenance"),
 }
 """Module of each command, by section of the help."""
 

@@ -1,8 +1,9 @@
-"""Commands that maintain a coordinator's data: remove versions and files, recover, and check."""
+"""Commands that maintain a coordinator's data: back up, remove, recover, and check."""
 
 import re
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from pathlib import Path
 
 import click
 from click.exceptions import Exit
@@ -16,6 +17,7 @@ from stickslip_services.database.database import Database, Role
 from stickslip_services.database.opening import check, opened
 from stickslip_services.errors import CommandError, DatabaseRefusedError
 from stickslip_services.local.supervisor import locked
+from stickslip_services.queue.backup import make_backup
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.maintenance import reindex as reindexed
 from stickslip_services.queue.maintenance import remove, unused
@@ -164,3 +166,34 @@ def scrub(settings: Settings, rate: float) -> None:
     repair = ": a service with workers recomputes their files" if damaged_count else ""
     say(f"{count} versions read, {damaged_count} damaged{repair}")
     raise Exit(1 if damaged_count else 0)
+
+
+@click.command()
+@click.argument(
+    "target", type=click.Path(path_type=Path, file_okay=False), help="empty, or an earlier backup"
+)
+@keeps
+def backup(settings: Settings, target: Path) -> None:
+    """Copy database, store and keys to a directory, also while the service runs.
+
+    Into an earlier backup, only new files are copied. A backup is a data directory: to restore it,
+    copy it, and start the service with it. The dump of a PostgreSQL database needs pg_restore, and
+    a bucket is not copied. Exit with 1 if a file of the store is damaged, or was deleted meanwhile.
+    """
+    _refuse_none(settings, Role.visitor)
+    copied = make_backup(settings, target)
+    tell(
+        f"{target} has {copied.artifacts:,} files, {copied.bytes / BYTES_A_MEGABYTE:,.1f} MB, of "
+        f"which {copied.new_artifacts:,}, {copied.new_bytes / BYTES_A_MEGABYTE:,.1f} MB, are new"
+    )
+    if settings.store is not None and settings.store.startswith("s3://"):
+        say(f"{settings.store} is not copied: turn on versioning of the bucket, or replicate it")
+    for digest in copied.damaged:
+        say(f"left out, because it is damaged: {digest}")
+    for digest in copied.missing:
+        say(f"left out, because it was deleted meanwhile: {digest}")
+    if copied.missing:
+        say("make the backup again, when `stickslip gc` has ended")
+    if copied.damaged:
+        say("`stickslip scrub` names the versions, and a service with workers recomputes the files")
+    raise Exit(1 if copied.damaged or copied.missing else 0)

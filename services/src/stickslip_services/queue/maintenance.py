@@ -132,7 +132,7 @@ def unused(database: Database, store: Store, *, older_than: float) -> Iterator[S
     the store. Raises CorruptArtifactError, OSError or ValueError if the manifest of a version
     cannot be read.
     """
-    needed = _needed(database, store)
+    needed = needed_artifacts(database, store)
     latest = time.time() - older_than
     for file in store.stored():
         is_needed = is_sha256(file.name) and bytes.fromhex(file.name) in needed
@@ -140,7 +140,7 @@ def unused(database: Database, store: Store, *, older_than: float) -> Iterator[S
             yield file
 
 
-def _needed(database: Database, store: Store) -> set[bytes]:
+def needed_artifacts(database: Database, store: Store) -> set[bytes]:
     """Return the digests of all artifacts that the database refers to."""
     needed: set[bytes] = set()
 

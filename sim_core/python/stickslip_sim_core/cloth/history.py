@@ -9,7 +9,7 @@ import numpy as np
 from stickslip_sim_core._sim_core import StepReport
 from stickslip_sim_core.arrays import Floats
 
-_COLUMNS = ("duration", "contact_work", "flow", "unconverged", "missed")
+_COLUMNS = ("duration", "contact_work", "flow", "unconverged", "missed", "uneven")
 
 
 class StepHistory:
@@ -17,19 +17,37 @@ class StepHistory:
 
     def __init__(self) -> None:
         self._rows: list[tuple[float, ...]] = []
+        self._friction: list[list[tuple[float, float]]] = []
 
     def add(self, duration: float, report: StepReport) -> None:
         """Add a step of `duration` [s]."""
         extremes = report.seen
         self._rows.append(
-            (duration, extremes.contact_work, extremes.flow, report.unconverged, report.missed)
+            (
+                duration,
+                extremes.contact_work,
+                extremes.flow,
+                report.unconverged,
+                report.missed,
+                report.uneven,
+            )
         )
+        self._friction.append(extremes.friction)
+
+    @property
+    def friction(self) -> Floats:
+        """Work of friction of each step, and the bound on its error: (steps, others, 2) [J].
+
+        The others are bodies, then surfaces, then sheets, with which cloth of another sheet rubs.
+        """
+        others = max(map(len, self._friction), default=0)
+        return np.reshape(self._friction, (len(self._friction), others, 2))
 
     def column(self, name: str) -> Floats:
         """Return a number of each step: (steps,).
 
         `duration` [s]; `contact_work` and `flow` [J], see `StepReport.seen`; `unconverged` and
-        `missed`, both 0 or 1.
+        `missed`, both 0 or 1; `uneven` [m], see `StepReport`.
         """
         rows = np.array(self._rows, float).reshape(-1, len(_COLUMNS))
         return np.asarray(rows[:, _COLUMNS.index(name)])

@@ -168,9 +168,15 @@ class ProtocolResult:
 
     @property
     def passed(self) -> bool:
+        """Whether all errors are within their tolerances and every step has converged.
+
+        A step above the tolerance of its preset is no measurement, however small the error is.
+        """
         limit = self.limit_error
-        return self.error <= self.tolerance and (
-            limit is None or limit <= (self.limit_tolerance or 0.0)
+        return (
+            self.error <= self.tolerance
+            and (limit is None or limit <= (self.limit_tolerance or 0.0))
+            and self.settings.get("unconverged_steps", 0) == 0
         )
 
     def as_dict(self) -> dict[str, Any]:

@@ -131,6 +131,11 @@ def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Sc
         arrays=lambda run: _arrays(run, sheets, things, ends),
         labels=lambda run: _labels(run, document, sheets, gravity.bias),
         kernel=kernel,
+        others=[
+            *(f"bodies.{body.name}" for body in things if body.rigid is not None),
+            *(f"bodies.{body.name}" for body in things if body.surface is not None),
+            *(f"sheets.{name}" for name in names),
+        ],
         reason=_hanging_fault(sheets),
     )
 

@@ -15,6 +15,7 @@ from stickslip_sim_core.cloth.fabrics import Fabric, custom_fabric, fabric
 from stickslip_sim_core.cloth.meshes import Mesh
 from stickslip_sim_core.cloth.presets import SolverSettings
 from stickslip_sim_core.cloth.solver import Cloth
+from stickslip_sim_core.scenes.evenness import uneven_until
 from stickslip_sim_core.scenes.frames import frame_at
 from stickslip_sim_core.scenes.holders import Hands, Holder
 from stickslip_sim_core.scenes.kind import IMPOSSIBLE_START, Array, Kind, OnFrame, Outcome, Record
@@ -157,6 +158,9 @@ class Scene:
     kernel: str | None = None
     """Level of the kernels, see `Cloth`."""
 
+    others: Sequence[str] = ()
+    """Names of bodies, then of surfaces, then of sheets, for the reasons of checks."""
+
     reason: str = ""
     """Reason why no run of the scene is valid, or empty."""
 
@@ -228,9 +232,18 @@ class Scene:
         for name, at in self.tracks.items():
             record[name] = np.stack([np.asarray(at(float(time))) for time in times])
         # Without self-contact cloth may pass through itself, so crossings are no fault.
-        worst = checks.values(checks.Seen(cloth, path, max(crossed) if self.self_contact else 0))
+        evidence = checks.Seen(
+            cloth,
+            path,
+            max(crossed) if self.self_contact else 0,
+            uneven_until(times[-1], cloth, hands.driving(self.motion)),
+            self.others,
+        )
+        worst = checks.values(evidence)
         # A start that is no equilibrium spoils the run even if all checks pass.
-        code, reason = ("solver_diverged", self.reason) if self.reason else checks.failed(worst)
+        code, reason = (
+            ("solver_diverged", self.reason) if self.reason else checks.failed(worst, evidence)
+        )
         run = ClothRun(
             positions=path,
             rest=self.mesh.rest,

@@ -183,6 +183,11 @@ CHECKS: Mapping[str, tuple[str, float | None]] = MappingProxyType(
             0.1,
         ),
         "passages": ("triangles that passed the core of a body", 0.0),
+        "friction_error": (
+            "relative error of the coefficient of friction with one body, surface or sheet, by "
+            "the size of cells, in the worst stretch",
+            0.03,
+        ),
     }
 )
 """Checks of the solver by name: the quantity, at its worst, and the limit of valid samples;

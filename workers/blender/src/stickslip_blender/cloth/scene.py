@@ -33,7 +33,7 @@ _FLOOR_RADIUS = 8.0  # [m]
 _FLOOR_RIM = 0.6  # [m]: it hides the horizon from a camera 8 degrees above the floor
 _WINDOW_MARGIN = 4  # [px] about the cloth
 _DISCARDED = 2  # [px] at a window's border, because the denoiser errs there
-_RAMP = 4  # [px] of the blend between the window and the frame, after the discarded ones
+_RAMP = 4  # [px of the default size] of the blend between the window and the frame, after them
 _MIRRORING = 0.3  # roughness below which a floor shows the cloth, outside the window
 _MIRROR_PATHS = 2  # factor of the frame's paths below this roughness
 
@@ -85,15 +85,25 @@ class ClothScene:
         self._reader = FrameReader(self._scene)
 
     def set_up(
-        self, camera: Camera, light: Light, substrate: Substrate, look: Look, track: Points
+        self,
+        camera: Camera,
+        light: Light,
+        substrate: Substrate,
+        look: Look,
+        track: Points,
+        *,
+        enlargement: float = 1.0,
     ) -> None:
         """Set the camera, the lamp, the floor and the fabric of the next clips.
 
-        The lamp points at the middle of the box that contains all vertices of the track (frames,
+        `enlargement` is the shorter side of the pictures over that of the default resolution. The
+        lamp points at the middle of the box that contains all vertices of the track (frames,
         V', 3) [m].
         """
         set_view(self._scene, camera)
         self._camera = camera
+        # In larger pictures a penumbra is wider, and so is the blend across it.
+        self._ramp = max(_RAMP, round(_RAMP * enlargement))
         self.substrate = substrate
         self._fabric.set_look(**_shader(look))
         self._lamp.set_source(_LAMP_POWER * light.power, light.source.diameter)
@@ -129,12 +139,12 @@ class ClothScene:
         light = self._reader.read_light().repeat(FINE, axis=0).repeat(FINE, axis=1)
 
         # Render the window of the cloth with more paths and FINE x FINE values a pixel.
-        part = self.window(points, _DISCARDED + _RAMP)
+        part = self.window(points, _DISCARDED + self._ramp)
         set_sampling(self._scene, Sampling(sampling.window, "plain", seed))
 
         # Blend the window into the frame, so that its border is invisible.
-        down = _blend_weights(part.top, part.bottom, self._camera.height)
-        across = _blend_weights(part.left, part.right, self._camera.width)
+        down = _blend_weights(part.top, part.bottom, self._camera.height, self._ramp)
+        across = _blend_weights(part.left, part.right, self._camera.width, self._ramp)
         here = part.times(FINE).slices
         finer = self._reader.read_light(part, FINE).astype(np.float32) - light[here]
         light[here] += np.minimum.outer(down, across)[..., None] * finer
@@ -167,14 +177,14 @@ class ClothScene:
             move_mesh(mesh, part)
 
 
-def _blend_weights(low: int, high: int, size: int) -> npt.NDArray[np.float32]:
+def _blend_weights(low: int, high: int, size: int, ramp: int) -> npt.NDArray[np.float32]:
     """Return the weight of a window [low, high) in a frame of a size [px], by finer pixels.
 
-    It is smooth at the window's ends, and 1 at the border of the frame.
+    It rises over `ramp` pixels, smoothly at the window's ends. At the border of the frame it is 1.
     """
     inside = low + (np.arange(FINE * (high - low)) + 0.5) / FINE
     ends = inside - (low if low > 0 else -np.inf), (high if high < size else np.inf) - inside
-    step = np.clip((np.minimum(*ends) - _DISCARDED) / _RAMP, 0.0, 1.0)
+    step = np.clip((np.minimum(*ends) - _DISCARDED) / ramp, 0.0, 1.0)
     return np.asarray(step * step * (3.0 - 2.0 * step), dtype=np.float32)
 
 
