@@ -29,7 +29,7 @@ class Velocities {
  public:
   explicit Velocities(int nodes);
 
-  // (nodes, 4), m/s: at the end of the last step. Whoever sets them restarts.
+  // (nodes, 4), m/s: at the end of the last step. A caller that sets them restarts.
   Buffer<double> at_end;
 
   // The next step starts from `at_end`, whose age is 0.

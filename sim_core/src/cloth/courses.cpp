@@ -1,0 +1,28 @@
+// How nodes moved in a step, by their contacts.
+#include "cloth/stepping.hpp"
+
+namespace sim_core {
+
+// How the nodes moved in the step that was solved.
+Courses Stepper::courses() const {
+  const Numbering& numbering = assembly_.numbering;
+  Courses out{std::vector<Course>(numbering.nodes, Course::bound)};
+  for (int i = 0; i < numbering.free_nodes; ++i) {
+    if (newton.contact.mode[i] == contact_open) out.of_node[i] = Course::free;
+    if (newton.contact.mode[i] == contact_slip) out.of_node[i] = Course::sliding;
+  }
+  if (!newton.pairs) return out;
+  for (const Pair& pair : newton.pairs->list()) {
+    if (pair.contact.force.isZero(0.0)) continue;
+    bool is_cloth = true;
+    for (int node : pair.stencil.node) {
+      if (pair.row.mode != contact_slip) out.of_node[node] = Course::bound;
+      if (out.of_node[node] == Course::free) out.of_node[node] = Course::sliding;
+      is_cloth = is_cloth && assembly_.mass[node] > 0.0;
+    }
+    out.pushes_itself = out.pushes_itself || is_cloth;
+  }
+  return out;
+}
+
+}  // namespace sim_core
