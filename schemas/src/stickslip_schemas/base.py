@@ -225,9 +225,6 @@ class Reason(StrEnum):
     penetration = "penetration"
     passages = "passages"
     friction_error = "friction_error"
-    # The same, of rows that earlier versions wrote.
-    sharpness = "sharpness"
-    missed = "missed"
     # Only jobs end or wait for these.
     cancelled = "cancelled"
     failed_tasks = "failed_tasks"

@@ -101,7 +101,7 @@ void bind_cloth(nb::module_& m) {
               out.emplace_back(with.work, with.error);
             return out;
           },
-          "Work of friction with each body, then surface, then sheet, and the bound on its error "
+          "Work of friction with each body, then surface, then sheet, and its estimated error "
           "[J].");
   m.attr("radius_least") = radius_least;
   nb::class_<StepReport>(m, "StepReport", "How a step of cloth went, or several.")

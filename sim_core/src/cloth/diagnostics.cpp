@@ -30,8 +30,8 @@ BodyContact contact_with(const Newton& newton, const std::vector<Body>& bodies, 
 // Cloth turns at nodes, by an angle a where the face of a body of radius R turns by it along a cell
 // h: sin(a/2) = h/(2 R). Friction would be off by up to a^2/8 of itself. At nodes it is corrected
 // for that (contact/capstan.hpp), and strips over rods, box edges and meshes were then off by less
-// than a^4/100, down to R of 0.75 cells: R = 1, mu 0.3 and 0.6: 0.3 % (bound 1.2 %); R = 0.75, mu
-// 0.6: 2.3 % (bound 4.5 %). Below, the correction vouches for nothing.
+// than a^4/100, down to R of 0.75 cells: R = 1, mu 0.3 and 0.6: 0.3 % (estimate 1.2 %); R = 0.75,
+// mu 0.6: 2.3 % (estimate 4.5 %). Below, the correction vouches for nothing.
 constexpr double corrected_to = 0.7;  // h/(2 R)
 
 double corrected_error(double lean) {

@@ -24,7 +24,7 @@ struct RungCount {
 // Of friction with one body, surface or sheet, J.
 struct FrictionWork {
   double work = 0.0;   // of what slides
-  double error = 0.0;  // bound on the part of it by which cells may be wrong
+  double error = 0.0;  // estimate of the part of it by which cells are wrong
 };
 
 // Worst values over the accepted steps, which the checks of a run judge, see checks.py.

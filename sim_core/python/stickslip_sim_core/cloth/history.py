@@ -36,7 +36,7 @@ class StepHistory:
 
     @property
     def friction(self) -> Floats:
-        """Work of friction of each step, and the bound on its error: (steps, others, 2) [J].
+        """Work of friction of each step, and its estimated error: (steps, others, 2) [J].
 
         The others are bodies, then surfaces, then sheets, with which cloth of another sheet rubs.
         """
