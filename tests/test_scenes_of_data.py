@@ -53,7 +53,7 @@ def test_a_built_in_scene_says_what_it_is_and_records_what_its_datasets_have(nam
     assert len(file.read_text().splitlines()) <= 80
     assert len(scene.description) > 80
     cells = {
-        f"sheets.{each}.mesh.cells": [max(4, count // 4) for count in given.mesh.cells]
+        f"sheets.{each}.mesh.cells": [max(4, count // 2) for count in given.mesh.cells]
         for each, given in scene.sheets.items()
         if given.mesh.type == "grid"
     }
@@ -141,7 +141,7 @@ class TestLanguage:
         A cubic between the ends of a step reaches through a fold that it hits.
         """
         document = load_scene("peg").model_dump(mode="json") | {"duration": 0.6, "frame_rate": 500}
-        document["sheets"]["cloth"]["mesh"]["cells"] = [8, 8]
+        document["sheets"]["cloth"]["mesh"]["cells"] = [9, 9]
         made = cloth_scene.scene(Scene.model_validate(document).physics(), seed=1)
         run = made.run()
         assert run.valid, run.reason
