@@ -192,7 +192,7 @@ def test_sheets_are_those_of_the_core() -> None:
     )
     given = document["sheets"]["cloth"]
     mine = start_of("cloth", given)
-    core = parts.sheet("cloth", given, {}, seed=0, kernel=None)
+    core = parts.sheet("cloth", given, {}, gravity=document["gravity"], seed=0, kernel=None)
     assert mine.cell == pytest.approx(core.mesh.spacing, rel=1e-12)
     np.testing.assert_allclose(mine.positions, core.start, atol=1e-15)
     np.testing.assert_array_equal(mine.mesh.triangles, core.mesh.triangles)
