@@ -153,7 +153,8 @@ class TestInclinedPlane:
         result = protocols.run("inclined-plane", friction=(0.1, 1.5), cells=6)
         assert result.passed
         assert result.error < 1e-3
-        assert result.settings["drift_mm"] < 1e-12  # a start of other rounding is all that differs
+        # A start of other rounding is all that differs.
+        assert result.settings["drift_mm"] < 1e-12  # type: ignore[operator]
 
     def test_creep_is_not_passed(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(inclined_plane.OnSlope, "drift", lambda _: 2e-5)
@@ -189,7 +190,7 @@ class TestMotion:
 
     @pytest.mark.parametrize("name", ["fall", "slide-to-rest"])
     def test_fails_for_a_wrong_gravity(self, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(motion, "GRAVITY", 1.005 * motion.GRAVITY)
+        monkeypatch.setattr(motion, "GRAVITY", 1.005 * GRAVITY)
         assert not protocols.run(name).passed
 
 
