@@ -9,6 +9,7 @@ import gc
 import json
 import logging
 import os
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,15 @@ os.environ.setdefault(
 os.environ.setdefault(
     "OMP_NUM_THREADS", "1"
 )  # threads of NumPy and torch wait by spinning, which the other tests pay
+
+# Tests started by nohup or in the background of a shell ignore these signals, and what they start
+# would, too: then no test of a signal could pass.
+for _signal, _handler in (
+    (signal.SIGHUP, signal.SIG_DFL),
+    (signal.SIGINT, signal.default_int_handler),
+):
+    if signal.getsignal(_signal) == signal.SIG_IGN:
+        signal.signal(_signal, _handler)
 
 SERVERS = {"service": "service", "cluster": "ray", "postgresql": "postgresql", "s3": "s3"}
 """Fixtures that start a server, and the group of the tests that share it. These tests are marked
