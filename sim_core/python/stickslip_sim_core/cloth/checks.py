@@ -219,14 +219,7 @@ def _unconverged(cloth: Cloth) -> float:
 
 def _lift(cloth: Cloth) -> float:
     """Return the work that lifts all cloth by the side of a cell [J]."""
-    return float(cloth.masses.sum() * GRAVITY * _cell(cloth))
-
-
-def _cell(cloth: Cloth) -> float:
-    """Return the mean side of a cell, which is a square of two triangles [m]."""
-    rest = cloth.mesh.rest[np.asarray(cloth.mesh.triangles)]
-    (a, b), (c, d) = np.moveaxis(rest[:, 1:] - rest[:, :1], 0, -1)
-    return float(np.sqrt(np.abs(a * d - b * c).mean()))
+    return float(cloth.masses.sum() * GRAVITY * cloth.mesh.spacing)
 
 
 def _friction_errors(cloth: Cloth) -> list[float]:
@@ -240,7 +233,7 @@ def _sharpest(seen: Seen) -> str:
     errors = _friction_errors(seen.cloth)
     other = int(np.argmax(errors))
     name = seen.others[other] if seen.others else f"number {other} of bodies, surfaces and sheets"
-    radius = 1e3 * _cell(seen.cloth)
+    radius = 1e3 * seen.cloth.mesh.spacing
     return (
         f"{name} is too sharp for the cells of the cloth: give it edges with a radius of "
         f"{radius:.3g} mm, a mesh a thickness of {2.0 * radius:.3g} mm, or the cloth finer cells"
