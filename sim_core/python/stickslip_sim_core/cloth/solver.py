@@ -329,6 +329,7 @@ class Cloth:
         path: Path | None = None,
         event: float = np.inf,
         damping: Callable[[float], float] = lambda _time: 0.0,
+        is_over: Callable[[], bool] = lambda: False,
     ) -> None:
         """Take steps until one ends at `end` [s] or later.
 
@@ -346,6 +347,7 @@ class Cloth:
                 `motion` for each time.
             event: Time of the next sudden change of the motion [s]. A step ends there.
             damping: Damping proportional to mass [1/s], added to the damping of each fabric.
+            is_over: Function that returns whether to stop, which is asked after each step.
 
         Raises:
             ValueError: `event` has passed, or `end` is not a number.
@@ -393,6 +395,8 @@ class Cloth:
                     max(0.0, self._spent - allowed * (self.time - self._before[0])) + report.newton
                 )
                 self.spent = max(self.spent, self._spent / allowed)
+            if is_over():
+                return
 
     @property
     def last_begin(self) -> float:
