@@ -45,8 +45,8 @@ double angle_between(const Vector3d& a, const Vector3d& b) {
 
 }  // namespace
 
-StepDiagnostics::StepDiagnostics(const ClothMesh& mesh, const Assembly& assembly, double inside)
-    : assembly_(assembly), inside_(inside), cell_(mesh.rest.rows(), 0.0) {
+StepDiagnostics::StepDiagnostics(const ClothMesh& mesh, const Assembly& assembly)
+    : assembly_(assembly), cell_(mesh.rest.rows(), 0.0) {
   std::vector<int> around(mesh.rest.rows(), 0);
   for (Eigen::Index t = 0; t < mesh.triangles.rows(); ++t) {
     Matrix2d sides;
@@ -170,7 +170,7 @@ void StepDiagnostics::measure_contacts(const StepTaken& step, const Newton& newt
     const Vector2d displacement = on.mean([&](int body) -> Vector2d {
       const Gap gap = gap_of(step.at_end[body], to);
       const double before = gap_of(step.at_start[body], from).distance;
-      const bool may_be = before < 0.0 && before >= -inside_;
+      const bool may_be = before < 0.0 && before >= -inside_depth;
       return {gap.distance - (may_be ? 0.0 : before), gap.normal.dot(on.gap.normal)};
     });
     const Vector3d slip = ContactState::slip(on, from, to, step.at_start, step.at_end);

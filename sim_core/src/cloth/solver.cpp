@@ -25,9 +25,9 @@ struct ClothSolver::Impl {
         surfaces(setup.surfaces),
         materials(setup.touch),
         assembly(kernel_level(setup.kernel).cloth, mesh, Fabrics(mesh, setup.fabrics), setup.held,
-                 static_cast<int>(surfaces.surface_of_vertex.size()), setup.constants.factor),
-        stepper(mesh, assembly, setup.settings, setup.constants),
-        controller(stepper, setup.control, setup.constants.control),
+                 static_cast<int>(surfaces.surface_of_vertex.size())),
+        stepper(mesh, assembly, setup.settings),
+        controller(stepper, setup.control),
         newton(stepper.newton),
         numbering(assembly.numbering) {
     stepper.sheets = mesh.sheets;
@@ -37,11 +37,10 @@ struct ClothSolver::Impl {
       newton.contact.cell[i] = cells[numbering.vertex[i]];
     }
     if ((materials.mu.array() >= 0.0).any()) {
-      newton.pairs = contact_set_of(mesh, numbering, materials, surfaces, setup.constants);
+      newton.pairs = contact_set_of(mesh, numbering, materials, surfaces);
     }
     if (numbering.others > 0) {
-      newton.contact.surfaces =
-          smooth_contact_of(mesh, numbering, materials, surfaces, setup.constants.smooth);
+      newton.contact.surfaces = smooth_contact_of(mesh, numbering, materials, surfaces);
     }
   }
 

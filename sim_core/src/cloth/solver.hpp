@@ -39,12 +39,10 @@ std::vector<double> cells_of_vertices(const ClothMesh& mesh);
 // Throws std::invalid_argument, naming the field, where the cloth would touch itself at rest.
 std::unique_ptr<ContactSet> contact_set_of(const ClothMesh& mesh, const Numbering& numbering,
                                            const ContactMaterials& materials,
-                                           const SurfaceMeshes& surfaces,
-                                           const Constants& constants);
+                                           const SurfaceMeshes& surfaces);
 std::unique_ptr<SmoothContact> smooth_contact_of(const ClothMesh& mesh, const Numbering& numbering,
                                                  const ContactMaterials& materials,
-                                                 const SurfaceMeshes& surfaces,
-                                                 const SmoothSettings& settings);
+                                                 const SurfaceMeshes& surfaces);
 
 // What a solver is made of.
 struct ClothSetup {
@@ -57,7 +55,6 @@ struct ClothSetup {
   std::string kernel;      // level of the kernels, "" for the widest that this processor runs
   ContactMaterials touch;  // among the sheets and then the surfaces
   SurfaceMeshes surfaces;
-  Constants constants;
 };
 
 class ClothSolver {

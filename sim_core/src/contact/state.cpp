@@ -7,6 +7,7 @@
 #include <utility>
 
 #include "contact/capstan.hpp"
+#include "contact/constants.hpp"
 #include "contact/rows.hpp"
 
 namespace sim_core {
@@ -17,9 +18,10 @@ using Eigen::Vector3d;
 
 // Round faces make corners of less than 66 degrees smaller and none below 53, for cloth comes out
 // of the cusp under a box's edge; flat ones below 26 degrees.
-double fillet_radius(const Gap& a, const Gap& b, double fillet) {
+double fillet_radius(const Gap& a, const Gap& b) {
   const double c = a.normal.dot(b.normal);
-  return fillet * std::clamp(a.flat && b.flat ? 10.0 + 10.0 * c : 3.0 + 5.0 * c, 0.0, 1.0);
+  return obstacles::corner *
+         std::clamp(a.flat && b.flat ? 10.0 + 10.0 * c : 3.0 + 5.0 * c, 0.0, 1.0);
 }
 
 // Takes the fillet between three bodies, or two where the last two are one, for the contact if its
@@ -28,16 +30,15 @@ double fillet_radius(const Gap& a, const Gap& b, double fillet) {
 // With normals n_i as the rows of N, and a_i what gap i lacks of the fillet's radius, the least way
 // out to where all gaps are that radius is w = N^-1 a = N^T l, where all l are positive; of two
 // bodies, n_3 = n_1 x n_2 and a_3 = 0. The gap of the fillet is the radius less |w|.
-void lay_fillet(const std::array<const BodyContact*, 3>& bodies, double fillet, BodyContact& on) {
+void lay_fillet(const std::array<const BodyContact*, 3>& bodies, BodyContact& on) {
   constexpr double parallel = 1e-6;  // determinant of unit normals
   const Gap& first = bodies[0]->gap;
   const Gap& second = bodies[1]->gap;
   const Gap& third = bodies[2]->gap;
   const bool has_third = bodies[2] != bodies[1];
-  double radius = std::min(fillet_radius(first, second, fillet), fillet);
+  double radius = std::min(fillet_radius(first, second), obstacles::corner);
   if (has_third) {
-    radius = std::min(
-        {radius, fillet_radius(first, third, fillet), fillet_radius(second, third, fillet)});
+    radius = std::min({radius, fillet_radius(first, third), fillet_radius(second, third)});
   }
   Matrix3d normals;
   normals << first.normal, second.normal,
@@ -65,7 +66,7 @@ void ForceNorms::count(double force_squared) {
     largest = std::sqrt(force_squared);
 }
 
-ContactState::ContactState(int free_nodes, const ContactSettings& settings)
+ContactState::ContactState(int free_nodes)
     : mode(free_nodes, contact_open),
       touched(free_nodes, -1),
       sheet(free_nodes, 0),
@@ -76,10 +77,7 @@ ContactState::ContactState(int free_nodes, const ContactSettings& settings)
       coupling(free_nodes, 0.0f),
       turning(free_nodes, 0.0f),
       force(4 * free_nodes + 64, 0.0f),
-      correction(4 * free_nodes + 64, 0.0f),
-      penalty_(settings.penalty),
-      turning_max_(settings.penalty / settings.law_stiffness),
-      fillet_(settings.fillet) {}
+      correction(4 * free_nodes + 64, 0.0f) {}
 
 ContactRows ContactState::rows() const {
   return {mode.data(), normal.data(), direction.data(), coupling.data(), turning.data()};
@@ -88,7 +86,7 @@ ContactRows ContactState::rows() const {
 void ContactState::penalty(int node, double own, float* out) const {
   std::fill(out, out + 6, 0.0f);
   if (mode[node] == contact_open) return;
-  const float k = static_cast<float>(penalty_) * static_cast<float>(own);
+  const float k = static_cast<float>(stiffness::factor) * static_cast<float>(own);
   const float* n = &normal[4L * node];
   const float* t = &direction[4L * node];
   const float side = mode[node] == contact_stick ? k : std::min(turning[node], k);
@@ -109,7 +107,7 @@ BodyContact ContactState::body_contact(const std::vector<Body>& bodies, const Ve
   for (std::size_t b = 0; b < bodies.size(); ++b) {
     BodyContact candidate{gap_of(bodies[b], p), static_cast<int>(b)};
     if (candidate.gap.distance < on.gap.distance) on = candidate;
-    if (!(candidate.gap.distance < 2.0 * fillet_)) continue;
+    if (!(candidate.gap.distance < 2.0 * obstacles::corner)) continue;
     for (int k = 0; k < count; ++k) {
       if (candidate.gap.distance < near[k].gap.distance) std::swap(candidate, near[k]);
     }
@@ -118,7 +116,7 @@ BodyContact ContactState::body_contact(const std::vector<Body>& bodies, const Ve
   // The fillets of each two bodies, and of each three.
   for (int k = 1; k < count; ++k) {
     for (int j = 1; j <= k; ++j) {
-      for (int i = 0; i < j; ++i) lay_fillet({&near[i], &near[j], &near[k]}, fillet_, on);
+      for (int i = 0; i < j; ++i) lay_fillet({&near[i], &near[j], &near[k]}, on);
     }
   }
   return on;
@@ -158,7 +156,7 @@ ForceNorms ContactState::classify_contacts(const Buffer<double>& x, const Buffer
                           at_node(direction, i).cast<double>().dot(law.direction) < 0.0;
     at_node(normal, i) = on.gap.normal.cast<float>();
     const LawResponse& chosen = stick_on_reversal && reversed ? sticking(contact) : law;
-    write(i, node_row(contact, chosen, turning_max_));
+    write(i, node_row(contact, chosen, stiffness::turning_max));
     norms.count(missed_squared(contact, law));
   }
   return norms;

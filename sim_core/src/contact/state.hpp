@@ -14,7 +14,6 @@
 #include "contact/linearized_contact.hpp"
 #include "contact/pn_triangles.hpp"
 #include "contact/rows.hpp"
-#include "contact/settings.hpp"
 #include "contact/surface.hpp"
 #include "math/buffer.hpp"
 
@@ -43,8 +42,7 @@ class SmoothContact {
   // largest triangle at each free node, m.
   SmoothContact(std::vector<std::array<int, 3>> triangles, std::vector<int> sheet_of_node,
                 const ContactMaterials& materials, const std::vector<double>& crease,
-                const Buffer<double>& x, const std::vector<double>& radius,
-                const SmoothSettings& settings);
+                const Buffer<double>& x, const std::vector<double>& radius);
 
   // Forgets which triangles are touched.
   void restart();
@@ -81,7 +79,6 @@ class SmoothContact {
   int free_nodes_;
   int first_ = std::numeric_limits<int>::max();  // of the surfaces' nodes, which are the last
   ContactMaterials materials_;
-  SmoothSettings settings_;
   PNTriangles patches_;
   TriangleTree tree_;
   PatchShape start_, end_;
@@ -118,7 +115,7 @@ struct BodyContact {
 
 class ContactState {
  public:
-  explicit ContactState(int free_nodes, const ContactSettings& settings = {});
+  explicit ContactState(int free_nodes);
 
   std::vector<int> mode,
       touched;  // (free nodes): ContactMode, and the body, or after them the surface (-1: none)
@@ -183,7 +180,6 @@ class ContactState {
     double dt = 0.0;  // 0: nothing is kept
   };
   History history_;
-  double penalty_, turning_max_, fillet_;
 };
 
 }  // namespace sim_core

@@ -32,7 +32,7 @@ PASSED_ON = (
     "newton_max",
     "krylov_tolerance",
     "refactor_after",
-    "patience",
+    "newton_before_halving",
     "halvings_max",
     "finest",
 )
@@ -148,7 +148,6 @@ class Cloth:
             surface_of_vertex=np.repeat(np.arange(len(sizes)), sizes).tolist(),
             surface_positions=self._surfaces_at(self.time),
             crease=[surface.crease for surface in self.surfaces],
-            constants=dict(preset.constants),
         )
         self._solver = self._make(held=self.held.tolist())
         # Time, positions and velocities before the last step. The time inf stands for no step yet.

@@ -99,9 +99,9 @@ class Certification:
     """Module whose build the certificate vouches for."""
 
     numbers: Callable[[], Mapping[str, Any]] = dict
-    """Function that returns the settings of the preset and constants of the solver.
+    """Function that returns the settings of the preset.
 
-    The values have JSON's types.
+    The values have JSON's types. Constants of the solver belong to its build.
     """
 
     quick: Mapping[str, Mapping[str, Any]] = field(default_factory=lambda: QUICK)
