@@ -27,12 +27,12 @@ using BodyTuple =
 
 using FabricTuple = std::tuple<double, StretchTable, Eigen::Matrix3d, double>;
 
-using MotionCallback =
+using ConditionsCallback =
     std::function<std::tuple<Points3, Points3, Points3, std::vector<BodyTuple>, double>(
         double time)>;
 
-using PathCallback =
-    std::function<std::pair<Points3, decltype(Track::poses)>(const std::vector<double>& times)>;
+using TableCallback = std::function<std::pair<Points3, decltype(MotionTable::poses)>(
+    const std::vector<double>& times)>;
 
 struct DriveNow {
   Points3 gravity, held, surfaces;
@@ -124,7 +124,7 @@ void bind_cloth(nb::module_& m) {
           },
           "How often each rung of the fallback ladder was tried and converged, by name.")
       .def_ro("seen", &StepReport::extremes)
-      .def_ro("uneven", &StepReport::uneven,
+      .def_ro("motion_error", &StepReport::motion_error,
               "Distance of what drives the cloth from an even motion within a step of the "
               "controller [m].")
       .def_ro("least_distance", &StepReport::least_distance,
@@ -149,7 +149,7 @@ void bind_cloth(nb::module_& m) {
              double tolerance, int newton_max, double krylov_tolerance, int refactor_after,
              int newton_before_halving, int halvings_max, double step_error, double longest_step,
              int finest, const std::string& kernel, const std::vector<double>& thickness,
-             const Eigen::MatrixXd& mu, double edge_share, double second_share,
+             const Eigen::MatrixXd& mu, double edge_fraction, double second_fraction,
              const Triangles& surface_triangles, const std::vector<std::int32_t>& surface_of_vertex,
              const Points3& surface_positions, const std::vector<double>& crease) {
             std::vector<ClothProperties> list;
@@ -166,14 +166,14 @@ void bind_cloth(nb::module_& m) {
                              {step_error, longest_step, finest},
                              kernel,
                              {thickness, mu, static_cast<int>(thickness.size() - crease.size()),
-                              edge_share, second_share},
+                              edge_fraction, second_fraction},
                              {surface_triangles, surface_of_vertex, surface_positions, crease}});
           },
           "rest"_a, "triangles"_a, "fabrics"_a, "held"_a, nb::kw_only(), "tolerance"_a,
           "newton_max"_a, "krylov_tolerance"_a, "refactor_after"_a, "newton_before_halving"_a,
           "halvings_max"_a, "step_error"_a, "longest_step"_a, "finest"_a, "kernel"_a, "thickness"_a,
-          "mu"_a, "edge_share"_a, "second_share"_a, "surface_triangles"_a, "surface_of_vertex"_a,
-          "surface_positions"_a, "crease"_a)
+          "mu"_a, "edge_fraction"_a, "second_fraction"_a, "surface_triangles"_a,
+          "surface_of_vertex"_a, "surface_positions"_a, "crease"_a)
       .def(
           "set_state",
           [](ClothSolver& self, const Points3& positions, const Points3& velocities,
@@ -192,25 +192,25 @@ void bind_cloth(nb::module_& m) {
           "dt"_a, "gravity"_a, "held"_a, "surfaces"_a, "bodies"_a, "damping"_a)
       .def(
           "advance",
-          [](ClothSolver& self, double time, double event, const MotionCallback& motion,
-             const PathCallback& path) {
+          [](ClothSolver& self, double time, double event, const ConditionsCallback& conditions,
+             const TableCallback& table) {
             DriveNow now;
             nb::gil_scoped_release release;
-            const auto drive = [&](double at) -> BoundaryConditions {
+            const auto conditions_at = [&](double at) -> BoundaryConditions {
               nb::gil_scoped_acquire acquire;
-              auto [gravity, held, surfaces, bodies, damping] = motion(at);
+              auto [gravity, held, surfaces, bodies, damping] = conditions(at);
               now = {gravity, held, surfaces, bodies_of(bodies)};
               return {now.gravity, now.held, now.surfaces, now.bodies, damping};
             };
-            const StepReport report =
-                self.advance(time, event, drive, [&](const std::vector<double>& times) -> Track {
-                  nb::gil_scoped_acquire acquire;
-                  auto [points, poses] = path(times);
-                  return {points, poses};
-                });
+            const auto table_at = [&](const std::vector<double>& times) -> MotionTable {
+              nb::gil_scoped_acquire acquire;
+              auto [points, poses] = table(times);
+              return {points, poses};
+            };
+            const StepReport report = self.advance(time, event, {conditions_at, table_at});
             return std::make_tuple(time, report);
           },
-          "time"_a, "event"_a, "motion"_a, "path"_a)
+          "time"_a, "event"_a, "conditions"_a, "table"_a)
       .def("momentum_rate", &ClothSolver::momentum_rate)
       .def("positions", &ClothSolver::positions)
       .def("velocities", &ClothSolver::velocities)

@@ -121,23 +121,23 @@ Membrane::Membrane(const ClothMesh& mesh, const Numbering& numbering, const Fabr
            law_.data(), tabulated_.data(), slots_.data(), nullptr};
 }
 
-void Membrane::set_lagged_stretch(const ClothKernel& kernel, const double* x, double share) {
+void Membrane::set_lagged_stretch(const ClothKernel& kernel, const double* x, double fraction) {
   data_.lag = nullptr;
-  if (share == 0.0 ||
+  if (fraction == 0.0 ||
       std::none_of(tabulated_.begin(), tabulated_.end(), [](char one) { return one != 0; }))
     return;
   lag_.resize(9L * membrane_lanes * data_.groups);
-  kernel.membrane_lag(data_, x, share, lag_.data());
+  kernel.membrane_lag(data_, x, fraction, lag_.data());
   data_.lag = lag_.data();
 }
 
 Assembly::Assembly(const ClothKernel& kernel_in, const ClothMesh& mesh, const Fabrics& fabrics,
-                   const std::vector<std::int32_t>& held, int others,
+                   const std::vector<std::int32_t>& held, int surface_vertices,
                    MatrixApproximation approximation)
     : kernel(kernel_in),
       stencils(bending_stencils(mesh, fabrics)),
       compact_stencils(bending_stencils(mesh, fabrics, true)),
-      numbering(mesh, stencils, compact_stencils, held, others),
+      numbering(mesh, stencils, compact_stencils, held, surface_vertices),
       mass_of_vertex(Eigen::VectorXd::Zero(mesh.rest.rows())),
       mass(numbering.nodes, 0.0),
       own_damping(numbering.nodes, 0.0),

@@ -35,7 +35,7 @@ class Membrane {
   Membrane(const Membrane&) = delete;
 
   const MembraneData& data() const { return data_; }
-  void set_lagged_stretch(const ClothKernel& kernel, const double* x, double share);
+  void set_lagged_stretch(const ClothKernel& kernel, const double* x, double fraction);
 
  private:
   Buffer<int> nodes_, slots_, fabric_;
@@ -56,9 +56,9 @@ struct MatrixApproximation {
 
 class Assembly {
  public:
-  // `others`: vertices of surfaces.
+  // `surface_vertices`: their number.
   Assembly(const ClothKernel& kernel, const ClothMesh& mesh, const Fabrics& fabrics,
-           const std::vector<std::int32_t>& held, int others,
+           const std::vector<std::int32_t>& held, int surface_vertices,
            MatrixApproximation approximation = {});
   Assembly(const Assembly&) = delete;
 
@@ -66,7 +66,7 @@ class Assembly {
   const std::vector<Stencil> stencils, compact_stencils;
   const Numbering numbering;
   Eigen::VectorXd mass_of_vertex;  // kg
-  Buffer<double> mass;             // (nodes), 0 for others
+  Buffer<double> mass;             // (nodes), 0 on surfaces
   Buffer<double> own_damping;      // (nodes): of the fabrics, 1/s
 
   // At the positions last evaluated.
@@ -78,10 +78,10 @@ class Assembly {
   bool use_convex_hessian = false;
 
   void evaluate(const Buffer<double>& x, bool with_matrix);
-  // From now on stretching lags behind what it is at x by this share, none if 0: see
+  // From now on stretching lags behind what it is at x by this fraction, none if 0: see
   // kernels/membrane.hpp.
-  void set_lagged_stretch(const Buffer<double>& x, double share) {
-    membrane_.set_lagged_stretch(kernel, x.data(), share);
+  void set_lagged_stretch(const Buffer<double>& x, double fraction) {
+    membrane_.set_lagged_stretch(kernel, x.data(), fraction);
   }
   // Inertia and damping [1/s], on top of the fabrics' own, of a step of dt, and of `interval`
   // between the velocities before and in it, s.

@@ -62,9 +62,9 @@ std::vector<int> sheets_of_nodes(const ClothMesh& mesh, const Numbering& numberi
                                  const SurfaceMeshes& surfaces) {
   std::vector<int> out(numbering.nodes, -1);
   for (int i = 0; i < numbering.vertices; ++i) out[numbering.node[i]] = mesh.sheet_of_vertex[i];
-  const int* others = numbering.node.data() + numbering.vertices;
-  for (int i = 0; i < numbering.others; ++i)
-    out[others[i]] = mesh.sheets + surfaces.surface_of_vertex[i];
+  const int* surface_nodes = numbering.node.data() + numbering.vertices;
+  for (int i = 0; i < numbering.surface_vertices; ++i)
+    out[surface_nodes[i]] = mesh.sheets + surfaces.surface_of_vertex[i];
   return out;
 }
 
@@ -114,11 +114,11 @@ std::unique_ptr<SmoothContact> smooth_contact_of(const ClothMesh& mesh, const Nu
                                                  const ContactMaterials& materials,
                                                  const SurfaceMeshes& surfaces) {
   Buffer<double> x(4L * numbering.nodes, 0.0);
-  const int* others = numbering.node.data() + numbering.vertices;
-  for (int i = 0; i < numbering.others; ++i)
-    at_node(x, others[i]) = surfaces.positions.row(i).transpose();
+  const int* surface_nodes = numbering.node.data() + numbering.vertices;
+  for (int i = 0; i < numbering.surface_vertices; ++i)
+    at_node(x, surface_nodes[i]) = surfaces.positions.row(i).transpose();
   Triples triangles;
-  append(surfaces.triangles, others, triangles);
+  append(surfaces.triangles, surface_nodes, triangles);
   std::vector<double> radius(numbering.free_nodes, 0.0);
   for (Eigen::Index t = 0; t < mesh.triangles.rows(); ++t) {
     const double own = circle_around(mesh, t);

@@ -165,7 +165,8 @@ void StepDiagnostics::measure_contacts(const StepTaken& step, const Newton& newt
     const Vector3d from = at_node(step.start, i), to = at_node(step.x, i),
                    force = at_node(newton.residual, i);
     const BodyContact on = contact_with(newton, step.at_end, b, to);
-    if (on.others[0] >= 0 && !energy_) continue;  // a start in a corner is let out of its fillet
+    if (on.neighbours[0] >= 0 && !energy_)
+      continue;  // a start in a corner is let out of its fillet
     // The change of a gap, and the share of its normal.
     const Vector2d displacement = on.mean([&](int body) -> Vector2d {
       const Gap gap = gap_of(step.at_end[body], to);
@@ -231,7 +232,7 @@ void StepDiagnostics::measure_friction(const StepTaken& step, const Newton& newt
     if (b < bodies) {
       const BodyContact on = contact_with(newton, step.at_end, b, to);
       slip = ContactState::slip(on, from, to, step.at_start, step.at_end);
-      hollow = on.others[0] >= 0;
+      hollow = on.neighbours[0] >= 0;
     } else {
       const Vector3d n = at_node(newton.contact.normal, i).cast<double>();
       slip = newton.contact.surfaces->slip(i, from, to);

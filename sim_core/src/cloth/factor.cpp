@@ -11,11 +11,11 @@ constexpr int piece_nodes = 48;
 constexpr std::size_t pool_max = 3;
 
 // Floats of the tiles of a front.
-long front_floats(long columns, long others) {
+long front_floats(long columns, long rows) {
   long floats = 0;
   for (long j = 0; j < columns; j += tile_columns) {
     const long width = std::min<long>(tile_columns, columns - j);
-    floats += tile_floats(width, columns + others - j - width);
+    floats += tile_floats(width, columns + rows - j - width);
   }
   return floats;
 }
@@ -130,12 +130,12 @@ FactorStorage::FactorStorage(const Pattern& bending, const Pattern& membrane,
       }
     }
     entry_begin.push_back(static_cast<long>(entry_slot.size()));
-    const long columns = 3L * (last - first), others = 3L * static_cast<long>(front_rows.size());
-    const long ld = pad(columns) + pad(others);
-    tile_begin.push_back(tile_begin.back() + front_floats(columns, others));
+    const long columns = 3L * (last - first), rows = 3L * static_cast<long>(front_rows.size());
+    const long ld = pad(columns) + pad(rows);
+    tile_begin.push_back(tile_begin.back() + front_floats(columns, rows));
     panel_max = std::max(panel_max, ld * columns);
-    local_max = std::max(local_max, columns + others);
-    const long update = pad(others) * others;
+    local_max = std::max(local_max, columns + rows);
+    const long update = pad(rows) * rows;
     if (piece[f] == f) {
       update_begin.push_back(update_floats);
       update_floats += update;
@@ -148,7 +148,7 @@ FactorStorage::FactorStorage(const Pattern& bending, const Pattern& membrane,
     children.insert(children.end(), below[f].begin(), below[f].end());
     child_begin.push_back(static_cast<int>(children.size()));
     for (long c = 0; c < columns; ++c)
-      work[f] += static_cast<double>(columns - c + others) * (columns - c + others);
+      work[f] += static_cast<double>(columns - c + rows) * (columns - c + rows);
   }
   run_begin.push_back(0);
   for (const std::vector<FrontRun>& front_runs : runs_of) {
@@ -222,9 +222,9 @@ double StaleFactor::renew(Assembly& assembly, const Buffer<double>& x, const Con
   }
   if (contact.mode == modes_) return 0.0;
   for (std::size_t i = 0; i < touched_.size(); ++i) touched_[i] = contact.mode[i] != modes_[i];
-  const double share = storage_.mark(touched_);
+  const double fraction = storage_.mark(touched_);
   refresh(assembly, contact);
-  return share;
+  return fraction;
 }
 
 void StaleFactor::make(Assembly& assembly, const Buffer<double>& x, const ContactState& contact,

@@ -94,7 +94,7 @@ SlopeFit mean_slope(const ClothMesh& mesh, const ClothMesh::Edge& edge, const Ve
   const double areas = mesh.area[edge.triangle[0]] + mesh.area[edge.triangle[1]];
   for (int side = 0; side < 2; ++side) {
     const int t = edge.triangle[side], other = edge.triangle[1 - side];
-    const double share = mesh.area[other] / areas;  // heights over the edge are as the areas
+    const double fraction = mesh.area[other] / areas;  // heights over the edge are as the areas
     fit.nodes[2 + side] = mesh.triangles(t, edge.corner[side]);
     for (int c = 0; c < 3; ++c) {
       const Vector2d along = (mesh.rest.row(mesh.triangles(t, (c + 2) % 3)) -
@@ -103,7 +103,7 @@ SlopeFit mean_slope(const ClothMesh& mesh, const ClothMesh::Edge& edge, const Ve
       const Vector2d gradient = -normal_of(along) * along.norm() / (2.0 * mesh.area[t]);
       const int node = mesh.triangles(t, c);
       const int place = node == edge.a ? 0 : node == edge.b ? 1 : 2 + side;
-      fit.weights[place] += share * normal.dot(gradient);
+      fit.weights[place] += fraction * normal.dot(gradient);
     }
   }
   return fit;

@@ -47,8 +47,8 @@ struct Dissector {
     // size.
     std::vector<int> best, best_low, best_high;
     const int size = static_cast<int>(nodes.size());
-    for (double share : {0.44, 0.48, 0.5}) {
-      std::vector<int> lower(nodes.begin(), nodes.begin() + static_cast<int>(share * size)), cut,
+    for (double fraction : {0.44, 0.48, 0.5}) {
+      std::vector<int> lower(nodes.begin(), nodes.begin() + static_cast<int>(fraction * size)), cut,
           upper;
       for (int i : nodes) side[i] = 2;
       for (int i : lower) side[i] = 1;
@@ -131,8 +131,10 @@ int Pattern::slot(int i, int j) const {
 
 Numbering::Numbering(const ClothMesh& mesh, const std::vector<Stencil>& stencils,
                      const std::vector<Stencil>& compact,
-                     const std::vector<std::int32_t>& held_vertices, int others_in)
-    : vertices(static_cast<int>(mesh.rest.rows())), others(others_in), nodes(vertices + others) {
+                     const std::vector<std::int32_t>& held_vertices, int surface_vertices_in)
+    : vertices(static_cast<int>(mesh.rest.rows())),
+      surface_vertices(surface_vertices_in),
+      nodes(vertices + surface_vertices) {
   const std::vector<int> free_vertices = free_of(vertices, held_vertices);
   free_nodes = static_cast<int>(free_vertices.size());
   std::vector<int> local(vertices, -1);

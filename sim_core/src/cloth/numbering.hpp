@@ -36,7 +36,7 @@ Pattern renumbered(const Graph& from, const std::vector<int>& order, const std::
 // Free vertices in the order of elimination, then held vertices, then the vertices of surfaces,
 // which are no cloth and move as prescribed.
 struct Numbering {
-  int vertices, others, nodes, free_nodes;
+  int vertices, surface_vertices, nodes, free_nodes;
   std::vector<int> node, vertex;  // of a vertex or another, and back
   std::vector<int> held;          // nodes of the held vertices, in the caller's order
   Dissection dissection;
@@ -44,7 +44,8 @@ struct Numbering {
 
   // Throws std::invalid_argument, naming `held`.
   Numbering(const ClothMesh& mesh, const std::vector<Stencil>& stencils,
-            const std::vector<Stencil>& compact, const std::vector<std::int32_t>& held, int others);
+            const std::vector<Stencil>& compact, const std::vector<std::int32_t>& held,
+            int surface_vertices);
 };
 
 }  // namespace sim_core

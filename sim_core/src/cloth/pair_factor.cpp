@@ -25,17 +25,17 @@ double PairFactor::renew(Assembly& assembly, const Buffer<double>& x, const Cont
     whole = true;
   }
   enter(whole);
-  double share = 1.0;
+  double fraction = 1.0;
   if (whole) {
     read_matrix(assembly, x);
     storage_->mark_all();
     age.restart(dt);
   } else {
     for (std::size_t i = 0; i < touched_.size(); ++i) due_[place_[i]] = touched_[i];
-    share = storage_->mark(due_);
+    fraction = storage_->mark(due_);
   }
   make(assembly);
-  return share;
+  return fraction;
 }
 
 void PairFactor::collect(const ContactSet& pairs, int free_nodes) {

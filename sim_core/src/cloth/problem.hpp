@@ -135,7 +135,7 @@ struct ClothKernel {
   // Adds gradients and returns the energy. `blocks` and `folds` may be null.
   double (*membrane)(const MembraneData&, const double* x, double* gradient, float* blocks,
                      bool definite);
-  void (*membrane_lag)(const MembraneData&, const double* x, double share, double* lag);
+  void (*membrane_lag)(const MembraneData&, const double* x, double fraction, double* lag);
   double (*bending)(const BendingData&, const double* x, double* gradient, float* stiffening,
                     FoldData* folds);
   void (*bending_matrix)(const BendingData&, const float* stiffening, float* scalars);

@@ -39,7 +39,7 @@ struct ClothSolver::Impl {
     if ((materials.mu.array() >= 0.0).any()) {
       newton.pairs = contact_set_of(mesh, numbering, materials, surfaces);
     }
-    if (numbering.others > 0) {
+    if (numbering.surface_vertices > 0) {
       newton.contact.surfaces = smooth_contact_of(mesh, numbering, materials, surfaces);
     }
   }
@@ -60,22 +60,23 @@ struct ClothSolver::Impl {
   }
 
   void load_surfaces(const Points3& positions, Buffer<double>& into) const {
-    if (positions.rows() != numbering.others) refuse("surfaces: must keep their vertices");
+    if (positions.rows() != numbering.surface_vertices)
+      refuse("surfaces: must keep their vertices");
     if (!positions.allFinite()) refuse("surfaces: positions must be finite");
-    for (int i = 0; i < numbering.others; ++i)
-      at_node(into, other(i)) = positions.row(i).transpose();
+    for (int i = 0; i < numbering.surface_vertices; ++i)
+      at_node(into, surface_node(i)) = positions.row(i).transpose();
   }
 
-  int other(int i) const { return numbering.node[numbering.vertices + i]; }
+  int surface_node(int i) const { return numbering.node[numbering.vertices + i]; }
 
   // Whether the cloth crosses anything that it touches.
-  bool crosses(const Points3& positions, const Points3& others) const {
-    Points3 points(positions.rows() + others.rows(), 3);
-    points << positions, others;
+  bool crosses(const Points3& positions, const Points3& of_surfaces) const {
+    Points3 points(positions.rows() + of_surfaces.rows(), 3);
+    points << positions, of_surfaces;
     Triangles all(mesh.triangles.rows() + surfaces.triangles.rows(), 3);
     all << mesh.triangles,
         (surfaces.triangles.array() + static_cast<std::int32_t>(positions.rows())).matrix();
-    int unfelt = self_intersections(others, surfaces.triangles);
+    int unfelt = self_intersections(of_surfaces, surfaces.triangles);
     if (!(materials.mu(0, 0) >= 0.0)) unfelt += self_intersections(positions, mesh.triangles);
     return self_intersections(points, all) > unfelt;
   }
@@ -121,10 +122,9 @@ StepReport ClothSolver::step(double dt, const Points3& gravity, const Points3& h
   return impl_->stepper.step(dt, {gravity, held, surfaces, bodies, damping});
 }
 
-StepReport ClothSolver::advance(double& time, double event, const Motion& motion,
-                                const Path& path) {
-  if (!impl_->stepper.started()) begin(motion(time).bodies);
-  return impl_->controller.advance(time, event, motion, path);
+StepReport ClothSolver::advance(double& time, double event, const PrescribedMotion& motion) {
+  if (!impl_->stepper.started()) begin(motion.conditions(time).bodies);
+  return impl_->controller.advance(time, event, motion);
 }
 
 Eigen::Vector3d ClothSolver::momentum_rate() const { return impl_->stepper.momentum_rate(); }
@@ -151,9 +151,9 @@ std::vector<std::int32_t> ClothSolver::sliding() const {
 }
 
 Points3 ClothSolver::surface_forces() const {
-  Points3 out(impl_->numbering.others, 3);
-  for (int i = 0; i < impl_->numbering.others; ++i) {
-    out.row(i) = -at_node(impl_->newton.residual, impl_->other(i)).transpose();
+  Points3 out(impl_->numbering.surface_vertices, 3);
+  for (int i = 0; i < impl_->numbering.surface_vertices; ++i) {
+    out.row(i) = -at_node(impl_->newton.residual, impl_->surface_node(i)).transpose();
   }
   const ContactState& contact = impl_->newton.contact;
   for (int i = 0; i < impl_->numbering.free_nodes; ++i) {

@@ -74,7 +74,7 @@ class ClothSolver {
                   const std::vector<Body>& bodies, double damping);
 
   // A step of the controller's choice: see StepController::advance.
-  StepReport advance(double& time, double event, const Motion& motion, const Path& path);
+  StepReport advance(double& time, double event, const PrescribedMotion& motion);
   // Rate of the cloth's momentum in the last step, N: the sum of all forces.
   Eigen::Vector3d momentum_rate() const;
 

@@ -64,7 +64,7 @@ struct StepReport {
   int newton = 0, krylov = 0;
   double least_distance =
       std::numeric_limits<double>::infinity();  // m: of cloth from cloth at the ends of steps
-  double uneven =
+  double motion_error =
       0.0;  // m: distance of what drives the cloth from an even motion in a step of the controller
   double factorizations = 0.0;                       // whole ones, and shares of those in part
   std::array<RungCount, rung_names.size()> rungs{};  // by Rung, rejected steps included
@@ -92,7 +92,7 @@ struct StepReport {
     converged = converged && other.converged;
     if (!(other.residual <= residual)) residual = other.residual;  // a NaN stays
     least_distance = std::min(least_distance, other.least_distance);
-    uneven = std::max(uneven, other.uneven);
+    motion_error = std::max(motion_error, other.motion_error);
     extremes.add(other.extremes);
   }
 };

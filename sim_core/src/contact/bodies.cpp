@@ -13,9 +13,9 @@ namespace {
 using Eigen::Vector2d;
 using Eigen::Vector3d;
 
-Corners at_share(const Corners& start, const Corners& end, double share) {
+Corners at_fraction(const Corners& start, const Corners& end, double fraction) {
   Corners out;
-  for (int c = 0; c < 3; ++c) out[c] = start[c] + share * (end[c] - start[c]);
+  for (int c = 0; c < 3; ++c) out[c] = start[c] + fraction * (end[c] - start[c]);
   return out;
 }
 
@@ -37,12 +37,12 @@ double change_of_sign(const F& f) {
 // Whether the inside of the triangle passes a point: where its volume with the point changes its
 // sign, the point lies in it.
 bool passes_point(const Corners& start, const Corners& end, const Vector3d& point) {
-  const double share = change_of_sign([&](double t) {
-    const Corners at = at_share(start, end, t);
+  const double fraction = change_of_sign([&](double t) {
+    const Corners at = at_fraction(start, end, t);
     return (at[0] - point).dot((at[1] - point).cross(at[2] - point));
   });
-  if (std::isnan(share)) return false;
-  const Corners at = at_share(start, end, share);
+  if (std::isnan(fraction)) return false;
+  const Corners at = at_fraction(start, end, fraction);
   const Vector3d normal = (at[1] - at[0]).cross(at[2] - at[0]);
   for (int c = 0; c < 3; ++c) {
     if (normal.dot((at[c] - point).cross(at[(c + 1) % 3] - point)) < 0.0) return false;
@@ -57,14 +57,14 @@ bool passes_segment(const Core& core, const Corners& start, const Corners& end, 
   const auto across = [&](const Vector3d& p) { return Vector2d(p[1 - along] - side, p[2]); };
   for (int c = 0; c < 3; ++c) {
     const int d = (c + 1) % 3;
-    const double share = change_of_sign([&](double t) {
+    const double fraction = change_of_sign([&](double t) {
       const Vector2d a = across(start[c] + t * (end[c] - start[c])),
                      b = across(start[d] + t * (end[d] - start[d]));
       return a.x() * b.y() - a.y() * b.x();
     });
-    if (std::isnan(share)) continue;
-    const Vector3d p = start[c] + share * (end[c] - start[c]),
-                   q = start[d] + share * (end[d] - start[d]);
+    if (std::isnan(fraction)) continue;
+    const Vector3d p = start[c] + fraction * (end[c] - start[c]),
+                   q = start[d] + fraction * (end[d] - start[d]);
     const Vector2d a = across(p), b = across(q);
     const double displacement = (a - b).squaredNorm(),
                  place = displacement > 0.0 ? a.dot(a - b) / displacement : 0.0;
@@ -111,12 +111,12 @@ Vector3d carried(const Body& begin, const Body& end, const Vector3d& x) {
   return end.origin + end.rotation * (begin.rotation.transpose() * (x - begin.origin));
 }
 
-Body between(const Body& a, const Body& b, double share) {
+Body between(const Body& a, const Body& b, double fraction) {
   Body out = b;
-  out.origin = a.origin + share * (b.origin - a.origin);
+  out.origin = a.origin + fraction * (b.origin - a.origin);
   if (a.rotation != b.rotation) {
     const Eigen::Quaterniond p(a.rotation), q(b.rotation);
-    out.rotation = p.slerp(share, q).toRotationMatrix();
+    out.rotation = p.slerp(fraction, q).toRotationMatrix();
   }
   return out;
 }

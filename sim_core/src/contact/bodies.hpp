@@ -37,7 +37,7 @@ Gap gap_of(const Body& body, const Eigen::Vector3d& x);
 Eigen::Vector3d carried(const Body& begin, const Body& end, const Eigen::Vector3d& x);
 
 // The body at a share of its motion from a to b: straight, and at an even turn.
-Body between(const Body& a, const Body& b, double share);
+Body between(const Body& a, const Body& b, double fraction);
 
 // The core of a body, which no cloth may pass: the body that got thinner from all sides until one
 // dimension was left with no thickness. A ball's is its centre, a cylinder's its axis, and a box's

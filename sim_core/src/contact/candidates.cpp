@@ -10,11 +10,11 @@ using Eigen::Array3d;
 using Box = Eigen::AlignedBox3d;
 
 template <std::size_t count>
-Box box_of(const std::array<int, count>& nodes, const Buffer<double>& x, double margin) {
+Box box_of(const std::array<int, count>& nodes, const Buffer<double>& x, double reach) {
   Box box;
   for (int node : nodes) box.extend(at_node(x, node));
-  box.min().array() -= margin;
-  box.max().array() += margin;
+  box.min().array() -= reach;
+  box.max().array() += reach;
   return box;
 }
 

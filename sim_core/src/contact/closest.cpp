@@ -84,11 +84,11 @@ double crossing_squared(const FourPoints& x) {
 }
 
 double MinDistanceRule::of(double distance) const {
-  return std::max(share * std::min(distance, most), std::min(distance, floor));
+  return std::max(fraction * std::min(distance, most), std::min(distance, floor));
 }
 
-double safe_share(PairKind kind, const FourPoints& x, const FourPoints& to,
-                  const MinDistanceRule& rule_of) {
+double safe_fraction(PairKind kind, const FourPoints& x, const FourPoints& to,
+                     const MinDistanceRule& rule_of) {
   FourPoints at = x, motion;
   Vector3d mean = Vector3d::Zero();
   for (int i = 0; i < 4; ++i) mean += 0.25 * (to[i] - x[i]);
@@ -105,21 +105,21 @@ double safe_share(PairKind kind, const FourPoints& x, const FourPoints& to,
   const double least = rule_of.of(distance);
   if (fastest <= distance - least) return 1.0;
   if (!(distance > 0.0) || !std::isfinite(fastest)) return 0.0;
-  double share = 0.0;
+  double fraction = 0.0;
   for (int k = 0; k < advances_max; ++k) {
     // The distance is at least `least` up to here, and above 0 up to `next`.
-    const double safe = share + (distance - least) / fastest;
+    const double safe = fraction + (distance - least) / fastest;
     if (safe >= 1.0) return 1.0;
-    const double next =
-        std::min(1.0, share + std::max((1.0 - step_rest) * distance, distance - least) / fastest);
+    const double next = std::min(
+        1.0, fraction + std::max((1.0 - step_rest) * distance, distance - least) / fastest);
     for (int i = 0; i < 4; ++i) at[i] = x[i] + next * motion[i];
     const double before =
         std::exchange(distance, between_closest(closest_weights(kind, at), at).norm());
-    if (distance < least) return share + (before - least) / fastest;
+    if (distance < least) return fraction + (before - least) / fastest;
     if (next == 1.0) return 1.0;
-    share = next;
+    fraction = next;
   }
-  return share;
+  return fraction;
 }
 
 TriangleTree::TriangleTree(std::vector<std::array<int, 3>> triangles, const Buffer<double>& x)

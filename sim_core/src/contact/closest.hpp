@@ -40,7 +40,7 @@ double crossing_squared(const FourPoints& x);
 // What a motion may leave of a distance, m: a share of it, or of `most` where that is less. Below
 // `floor` it takes nothing, else many motions would take a distance to rounding, and past it.
 struct MinDistanceRule {
-  double share;
+  double fraction;
   double most;
   double floor = 0.0;
 
@@ -50,8 +50,8 @@ struct MinDistanceRule {
 // A share of the straight motion from x to `to` up to which the distance stays above the required
 // share of that at x; 1 if it does to the end. Never too large, and too small by little [Li et al.
 // 2021, additive CCD, Algorithm 1].
-double safe_share(PairKind kind, const FourPoints& x, const FourPoints& to,
-                  const MinDistanceRule& rule_of);
+double safe_fraction(PairKind kind, const FourPoints& x, const FourPoints& to,
+                     const MinDistanceRule& rule_of);
 
 // The triangle that is nearest to a point.
 struct Nearest {

@@ -119,9 +119,9 @@ void ContactSet::store_history() {
   }
 }
 
-void ContactSet::update(const Buffer<double>& x, double share, Buffer<double>& residual) {
+void ContactSet::update(const Buffer<double>& x, double step_length, Buffer<double>& residual) {
   find(x);
-  transfer(share);
+  transfer(step_length);
   merge();
   linearize_at(x);
   for (const Pair& pair : pairs_) {
@@ -131,10 +131,10 @@ void ContactSet::update(const Buffer<double>& x, double share, Buffer<double>& r
   }
 }
 
-void ContactSet::add_stiffness(double share, std::vector<double>& stiffness) const {
+void ContactSet::add_stiffness(double fraction, std::vector<double>& stiffness) const {
   for (const Pair& pair : pairs_) {
     if (!pair.active()) continue;
-    const double own = share * pair.row.symmetric.trace() / (3.0 * pair.penalty_scale);
+    const double own = fraction * pair.row.symmetric.trace() / (3.0 * pair.penalty_scale);
     for (int c = 0; c < 4; ++c) {
       if (pair.stencil.node[c] < free_nodes_)
         stiffness[pair.stencil.node[c]] += pair.weights[c] * pair.weights[c] * own;

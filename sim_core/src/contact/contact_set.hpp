@@ -90,9 +90,9 @@ class ContactSet {
   // Keeps the forces at the end of a step for the next one.
   void store_history();
 
-  // Finds and linearizes the pairs at x, with a share of the forces' last changes, and subtracts
-  // their forces from the residual.
-  void update(const Buffer<double>& x, double share, Buffer<double>& residual);
+  // Finds and linearizes the pairs at x, with a step length along the forces' last changes, and
+  // subtracts their forces from the residual.
+  void update(const Buffer<double>& x, double step_length, Buffer<double>& residual);
   // After the first look of a step: activates pairs that have a force and are open by no more than
   // what a prediction on straight lines opens over curved cloth. Returns whether there are any.
   bool warm_start();
@@ -110,8 +110,8 @@ class ContactSet {
   PairData rows();
   // Subtracts from nodal forces what the pairs contribute to the right-hand side.
   void subtract_right_side(Buffer<float>& force) const;
-  // Adds a share of the stiffness by which pairs hold the free nodes, N/m.
-  void add_stiffness(double share, std::vector<double>& stiffness) const;
+  // Adds a fraction of the stiffness by which pairs hold the free nodes, N/m.
+  void add_stiffness(double fraction, std::vector<double>& stiffness) const;
   // Counts the forces by which the law is missed, where this stiffness [N/m] turns gaps and slips
   // into forces.
   void count_errors(double stiffness, ForceNorms& norms) const;
@@ -143,7 +143,7 @@ class ContactSet {
            const Buffer<double>& x);
   Eigen::Vector3d slip(const Candidate& stencil, const Eigen::Vector4d& weights,
                        const Eigen::Vector3d& rho);
-  void transfer(double share);
+  void transfer(double step_length);
   void merge();
   void linearize_at(const Buffer<double>& x);
 

@@ -234,9 +234,9 @@ Matrix3d ContactSet::turn_of(const Candidate& stencil, const Vector4d& weights) 
   Matrix3d turn = Matrix3d::Zero();
   for (int c = 0; c < 4; ++c) {
     const int own = sheet_of_node[stencil.node[c]], other = stencil.on_first(c) ? b : a;
-    const double share = own >= materials.sheets ? 1.0 : other >= materials.sheets ? 0.0 : 0.5;
-    if (share * weights[c] != 0.0)
-      turn += share * std::abs(weights[c]) * turns_.of(near.surface, stencil.node[c]);
+    const double fraction = own >= materials.sheets ? 1.0 : other >= materials.sheets ? 0.0 : 0.5;
+    if (fraction * weights[c] != 0.0)
+      turn += fraction * std::abs(weights[c]) * turns_.of(near.surface, stencil.node[c]);
   }
   return turn;
 }

@@ -19,23 +19,23 @@ auto key(const Any& pair) {
 
 }  // namespace
 
-// Transfers the forces of earlier pairs, with a share of their last changes, to the pairs at hand,
-// both sorted by kind, first and feature. The force of a pair that is gone goes to the new pair of
-// the same vertex, or of one of its edges, whose normal is most alike: the closest feature has
-// changed; else to the nearest pair. Under the exact law the proximal stiffness of pairs that stall
-// grows.
-void ContactSet::transfer(double share) {
+// Transfers the forces of earlier pairs, with a step length along their last changes, to the pairs
+// at hand, both sorted by kind, first and feature. The force of a pair that is gone goes to the new
+// pair of the same vertex, or of one of its edges, whose normal is most alike: the closest feature
+// has changed; else to the nearest pair. Under the exact law the proximal stiffness of pairs that
+// stall grows.
+void ContactSet::transfer(double step_length) {
   std::vector<const PairPast*> orphans;
   std::vector<std::size_t> fresh;
   std::size_t o = 0;
   for (std::size_t i = 0; i < pairs_.size(); ++i) {
     for (; o < base_.size() && key(base_[o]) < key(pairs_[i]); ++o) orphans.push_back(&base_[o]);
     if (o < base_.size() && key(base_[o]) == key(pairs_[i])) {
-      pairs_[i].contact.force = base_[o].force + share * base_[o].change;
+      pairs_[i].contact.force = base_[o].force + step_length * base_[o].change;
       pairs_[i].penalty_scale = base_[o].penalty_scale;
       const int mode = base_[o].mode;
       const double last = base_[o].missed, now = violation(pairs_[i].contact, mode);
-      if (smoothing == 0.0 && share == 1.0 && mode != contact_open &&
+      if (smoothing == 0.0 && step_length == 1.0 && mode != contact_open &&
           last > pairs::length_tolerance && last < pairs::half_layer * pairs_[i].thickness &&
           now > pairs::converging * last) {
         pairs_[i].penalty_scale =
@@ -50,7 +50,7 @@ void ContactSet::transfer(double share) {
   }
   for (; o < base_.size(); ++o) orphans.push_back(&base_[o]);
   for (const PairPast* orphan : orphans) {
-    const Vector3d force = orphan->force + share * orphan->change;
+    const Vector3d force = orphan->force + step_length * orphan->change;
     if (force.isZero(0.0)) continue;
     std::size_t match = pairs_.size();
     double best = pairs::match_cosine;

@@ -37,9 +37,9 @@ CandidateSet::CandidateSet(Surface surface_in, double thickness_in, double skin)
     : surface(std::move(surface_in)),
       thickness(thickness_in),
       skin_(skin),
-      share_(surface.sheet_of_node.size(), 1.0),
-      drift_(share_),
-      displacement_(share_) {}
+      fraction_(surface.sheet_of_node.size(), 1.0),
+      drift_(fraction_),
+      displacement_(fraction_) {}
 
 MinDistanceRule CandidateSet::rule() const {
   return {path::distance_fraction, thickness, path::distance_min * thickness};
@@ -87,23 +87,24 @@ bool CandidateSet::limit_by_ccd(const Buffer<double>& from, Buffer<double>& to, 
   Buffer<double> at = from;
   bool whole = true;
   for (int hop = 0; hop < hops_max; ++hop) {
-    const auto part = [&](double share) {
+    const auto part = [&](double fraction) {
       Buffer<double> out = at;
-      for (int i : surface.vertices) at_node(out, i) += share * (at_node(to, i) - at_node(at, i));
+      for (int i : surface.vertices)
+        at_node(out, i) += fraction * (at_node(to, i) - at_node(at, i));
       return out;
     };
     // From the middle of a hop both of its ends are within the skin, but for a common
     // displacement. Nodes that are stopped do not go that: so where there are any, the hop is
     // shorter.
-    double share = std::min(1.0, 2.0 * skin_ / moved(at, to));
-    rebuild(part(0.5 * share));
-    Buffer<double> wanted = part(share), next = wanted;
+    double fraction = std::min(1.0, 2.0 * skin_ / moved(at, to));
+    rebuild(part(0.5 * fraction));
+    Buffer<double> wanted = part(fraction), next = wanted;
     bool stopped = !limit_listed(at, next);
     const double shorter = skin_ / moved(part(0.5), at, &to);
-    if (stopped && shorter < share) {
-      share = shorter;
-      rebuild(part(0.5 * share));
-      wanted = next = part(share);
+    if (stopped && shorter < fraction) {
+      fraction = shorter;
+      rebuild(part(0.5 * fraction));
+      wanted = next = part(fraction);
       stopped = !limit_listed(at, next);
     }
     if (stopped) {  // who is has arrived
@@ -113,7 +114,7 @@ bool CandidateSet::limit_by_ccd(const Buffer<double>& from, Buffer<double>& to, 
       }
     }
     at = std::move(next);
-    if (share == 1.0) return whole;
+    if (fraction == 1.0) return whole;
   }
   for (int i : surface.vertices) at_node(to, i) = at_node(at, i);
   return false;
@@ -125,41 +126,41 @@ double CandidateSet::collision_free_fraction(const Buffer<double>& from, const B
   measure(from, to, displacement_);
   for (const Candidate& pair : near) {
     if (fastest(pair, displacement_) <= pair.distance - rule().of(pair.distance)) continue;
-    least =
-        std::min(least, safe_share(pair.kind, points_of(pair, from), points_of(pair, to), rule()));
+    least = std::min(least,
+                     safe_fraction(pair.kind, points_of(pair, from), points_of(pair, to), rule()));
   }
   return least;
 }
 
 Eigen::Vector3d CandidateSet::limited(int node, const Buffer<double>& from,
                                       const Buffer<double>& to) const {
-  if (share_[node] == 1.0) return at_node(to, node);
-  return at_node(from, node) + share_[node] * (at_node(to, node) - at_node(from, node));
+  if (fraction_[node] == 1.0) return at_node(to, node);
+  return at_node(from, node) + fraction_[node] * (at_node(to, node) - at_node(from, node));
 }
 
 // The share of its way from `from` to where its nodes are let that a pair may go.
-double CandidateSet::safe_share_of(const Candidate& pair, const Buffer<double>& from,
-                                   const Buffer<double>& to) const {
+double CandidateSet::safe_fraction_of(const Candidate& pair, const Buffer<double>& from,
+                                      const Buffer<double>& to) const {
   const double distance = pair.distance - fastest(pair, drift_);
   if (fastest(pair, displacement_) <= distance - rule().of(distance)) return 1.0;
   FourPoints ends;
   for (int c = 0; c < 4; ++c) ends[c] = limited(pair.node[c], from, to);
-  return safe_share(pair.kind, points_of(pair, from), ends, rule());
+  return safe_fraction(pair.kind, points_of(pair, from), ends, rule());
 }
 
 bool CandidateSet::limit_listed(const Buffer<double>& from, Buffer<double>& to) {
   measure(at_, from, drift_);
   const Eigen::Vector3d common = measure(from, to, displacement_);
-  std::fill(share_.begin(), share_.end(), 1.0);
-  const auto shorten = [&](int i, double share) {
-    share_[i] *= share;
+  std::fill(fraction_.begin(), fraction_.end(), 1.0);
+  const auto shorten = [&](int i, double fraction) {
+    fraction_[i] *= fraction;
     displacement_[i] = (limited(i, from, to) - at_node(from, i) - common).norm();
   };
   bool whole = true;
   for (int round = 0; round <= rounds_max; ++round) {
     double least = 1.0;
     for (const Candidate& pair : pairs_) {
-      const double safe = safe_share_of(pair, from, to);
+      const double safe = safe_fraction_of(pair, from, to);
       if (safe == 1.0) continue;
       least = std::min(least, safe);
       if (round == rounds_max) continue;
@@ -168,11 +169,11 @@ bool CandidateSet::limit_listed(const Buffer<double>& from, Buffer<double>& to) 
     if (least == 1.0) break;
     whole = false;
     if (round == rounds_max) {
-      for (int i : surface.vertices) share_[i] *= least;
+      for (int i : surface.vertices) fraction_[i] *= least;
     }
   }
   for (int i : surface.vertices) {
-    if (share_[i] != 1.0) at_node(to, i) = limited(i, from, to);
+    if (fraction_[i] != 1.0) at_node(to, i) = limited(i, from, to);
   }
   return whole;
 }

@@ -70,13 +70,13 @@ class CandidateSet {
   bool limit_listed(const Buffer<double>& from, Buffer<double>& to);
   // Where a node on its way to `to` is stopped, as far as is known in `limit_listed`.
   Eigen::Vector3d limited(int node, const Buffer<double>& from, const Buffer<double>& to) const;
-  double safe_share_of(const Candidate& pair, const Buffer<double>& from,
-                       const Buffer<double>& to) const;
+  double safe_fraction_of(const Candidate& pair, const Buffer<double>& from,
+                          const Buffer<double>& to) const;
 
   double skin_;
   std::vector<Candidate> pairs_;
   Buffer<double> reference_, at_;  // where they were looked for, and where their distances are from
-  std::vector<double> share_, drift_, displacement_;
+  std::vector<double> fraction_, drift_, displacement_;
 };
 
 }  // namespace sim_core

@@ -98,21 +98,21 @@ PNRoot::PNRoot(const PNPatch& patch, const Vector3d& p) {
   b[1] = from.cross(v).dot(w) / w.squaredNorm();
   b[2] = u.cross(from).dot(w) / w.squaredNorm();
   b[0] = 1.0 - b[1] - b[2];
-  double share = from.dot(w) / w.norm();  // height over |n|, which is nearly 1
+  double height_ratio = from.dot(w) / w.norm();  // height over |n|, which is nearly 1
   for (int i = 0; i < iterations_max && b.minCoeff() > -beyond_edge; ++i) {
-    const Matrix3d slope = patch.dy(b) + share * patch.dn(b);
+    const Matrix3d slope = patch.dy(b) + height_ratio * patch.dn(b);
     normal = patch.n(b);
     Matrix3d jacobian;
     jacobian << slope.col(1) - slope.col(0), slope.col(2) - slope.col(0), normal;
     const double size = jacobian.determinant();
     // Beyond a centre of curvature the axes turn over.
     if (!(size > jacobian_min * w.norm())) return;
-    const Vector3d change = jacobian.inverse() * (p - patch.y(b) - share * normal);
+    const Vector3d change = jacobian.inverse() * (p - patch.y(b) - height_ratio * normal);
     b += Vector3d(-change[0] - change[1], change[0], change[1]);
-    share += change[2];
+    height_ratio += change[2];
     if (change.head<2>().cwiseAbs().maxCoeff() > converged) continue;
     normal = patch.n(b);
-    height = share * normal.norm();
+    height = height_ratio * normal.norm();
     normal.normalize();
     point = patch.y(b);
     found = true;
@@ -263,10 +263,10 @@ double PNTriangles::side_of(const PatchShape& shape, const Vector3d& p, int t,
     if (weights[k] == 1.0) {
       normal.setZero();
       for (int a = mesh_.around_begin[corners[k]]; a < mesh_.around_begin[corners[k] + 1]; ++a) {
-        const auto& others = mesh_.triangles[mesh_.around[a]];
+        const auto& corners_there = mesh_.triangles[mesh_.around[a]];
         const int own = mesh_.corner_of(mesh_.around[a], corners[k]);
-        const Vector3d e = at_node(shape.x, others[next(own)]) - c,
-                       f = at_node(shape.x, others[after_next(own)]) - c;
+        const Vector3d e = at_node(shape.x, corners_there[next(own)]) - c,
+                       f = at_node(shape.x, corners_there[after_next(own)]) - c;
         normal +=
             std::atan2(e.cross(f).norm(), e.dot(f)) * mesh_.facet_normal(shape.x, mesh_.around[a]);
       }

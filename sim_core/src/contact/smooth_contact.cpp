@@ -43,8 +43,8 @@ SmoothContact::SmoothContact(std::vector<std::array<int, 3>> triangles,
       materials_(materials),
       patches_(triangles, x, creases(triangles, sheet_of_node_, materials.sheets, crease)),
       tree_(patches_.triangles(), x),
-      track_{std::vector<int>(radius.size(), -1), std::vector<double>(radius.size(), 1.0)},
-      history_(track_),
+      touched_{std::vector<int>(radius.size(), -1), std::vector<double>(radius.size(), 1.0)},
+      history_(touched_),
       projections_(radius.size()) {
   for (const auto& corners : triangles)
     first_ = std::min(first_, *std::min_element(corners.begin(), corners.end()));
@@ -57,9 +57,9 @@ void SmoothContact::restart() {
 void SmoothContact::store_history(const std::vector<int>& mode) {
   for (int i = 0; i < free_nodes_; ++i) {
     const bool stays =
-        track_.triangle[i] >= 0 && mode[i] != contact_open && projections_[i].on_patch;
-    history_.triangle[i] = stays ? track_.triangle[i] : std::min(track_.triangle[i], -1);
-    history_.side[i] = track_.side[i];
+        touched_.triangle[i] >= 0 && mode[i] != contact_open && projections_[i].on_patch;
+    history_.triangle[i] = stays ? touched_.triangle[i] : std::min(touched_.triangle[i], -1);
+    history_.side[i] = touched_.side[i];
   }
 }
 
@@ -87,32 +87,32 @@ void SmoothContact::begin(const Buffer<double>& start, const Buffer<double>& end
   const double spread = 0.5 * ways.diagonal().norm();
   const double thickness =
       *std::max_element(materials_.thickness.begin(), materials_.thickness.end());
-  track_ = history_;
+  touched_ = history_;
   for (int i = 0; i < free_nodes_; ++i) {
     const Vector3d p = at_node(start, i);
-    const bool came = track_.triangle[i] == left_to_pairs,
+    const bool came = touched_.triangle[i] == left_to_pairs,
                near = began_near(at_start, p, obstacles::corner);
-    if (near) track_.triangle[i] = left_to_pairs;
-    if (near || track_.triangle[i] >= 0 || sheet_of_node_[i] < 0) continue;
+    if (near) touched_.triangle[i] = left_to_pairs;
+    if (near || touched_.triangle[i] >= 0 || sheet_of_node_[i] < 0) continue;
     const double kept =
         thickness + 0.5 * obstacles::curvature_max * radius_[i] + start_.bulge;  // at most
     const double reach =
         kept + obstacles::reach * ((at_node(guess, i) - p - common).norm() + spread + thickness);
     const Nearest found = tree_.nearest(
         p, reach, [&](int t) { return materials_.mu(sheet_of_node_[i], surface_of(t)) >= 0.0; });
-    track_.triangle[i] = found.triangle;
+    touched_.triangle[i] = found.triangle;
     if (found.triangle < 0) continue;
-    track_.side[i] = patches_.side_of(start_, p, found.triangle, found.weights);
-    if (came && !depenetration(i, p, 0.0).isZero()) track_.triangle[i] = left_to_pairs;
+    touched_.side[i] = patches_.side_of(start_, p, found.triangle, found.weights);
+    if (came && !depenetration(i, p, 0.0).isZero()) touched_.triangle[i] = left_to_pairs;
   }
 }
 
 std::optional<SmoothTouch> SmoothContact::touch(int node, const Vector3d& p) {
-  if (track_.triangle[node] < 0) return std::nullopt;
+  if (touched_.triangle[node] < 0) return std::nullopt;
   const std::optional<Projection> found =
-      patches_.projection(end_, p, track_.triangle[node], track_.side[node]);
+      patches_.projection(end_, p, touched_.triangle[node], touched_.side[node]);
   if (!found) return std::nullopt;
-  if (found->on_patch) track_.triangle[node] = found->triangle;
+  if (found->on_patch) touched_.triangle[node] = found->triangle;
   projections_[node] = *found;
   return SmoothTouch{found->height - rest_distance(end_, node, *found), found->normal,
                      surface_of(found->triangle) - materials_.sheets};
@@ -124,16 +124,16 @@ double SmoothContact::rest_distance(const PatchShape& shape, int node,
   const int sheet = sheet_of_node_[node], surface = surface_of(projection.triangle);
   const double r = radius_[node];
   const double curvature =
-      patches_.curvature(shape, projection.triangle, projection.weights, track_.side[node]);
+      patches_.curvature(shape, projection.triangle, projection.weights, touched_.side[node]);
   const double sinking = 0.5 * r * r * std::min(curvature, obstacles::curvature_max / r);
   return std::max(materials_.mean(sheet, surface),
                   materials_.rest_distance(sheet, surface) + sinking);
 }
 
 Vector3d SmoothContact::depenetration(int node, const Vector3d& before, double allowed) const {
-  if (track_.triangle[node] < 0) return Vector3d::Zero();
+  if (touched_.triangle[node] < 0) return Vector3d::Zero();
   const std::optional<Projection> projection =
-      patches_.projection(start_, before, track_.triangle[node], track_.side[node]);
+      patches_.projection(start_, before, touched_.triangle[node], touched_.side[node]);
   const double depth =
       projection ? rest_distance(start_, node, *projection) - projection->height : 0.0;
   return depth > allowed ? depth * projection->normal : Vector3d::Zero().eval();
@@ -156,7 +156,7 @@ double SmoothContact::mu(int node) const {
 Vector3d SmoothContact::normal_near(int node, const Vector3d& p) const {
   const Projection& last = projections_[node];
   const std::optional<Projection> found =
-      patches_.projection(end_, p, last.triangle, track_.side[node]);
+      patches_.projection(end_, p, last.triangle, touched_.side[node]);
   return found ? found->normal : last.normal;
 }
 

@@ -228,7 +228,7 @@ Contact ContactState::contact_at(int node, const BodyContact& on, const Buffer<d
               force,           mu_here, stiffness[node]};
   // Planes are flat, and fillets hollow: there cloth does not turn at nodes.
   const Body& body = at_end[on.body];
-  if (body.shape != Body::plane && on.others[0] < 0) {
+  if (body.shape != Body::plane && on.neighbours[0] < 0) {
     out.mu =
         corrected_mu(out, node, p, [&](const Vector3d& near) { return gap_of(body, near).normal; });
   }

@@ -82,11 +82,11 @@ class SmoothContact {
   PNTriangles patches_;
   TriangleTree tree_;
   PatchShape start_, end_;
-  struct Track {
+  struct TouchedTriangles {
     std::vector<int> triangle;  // (free nodes): -1: none is near; -2: left to pairs
     std::vector<double> side;
   };
-  Track track_, history_;
+  TouchedTriangles touched_, history_;
   std::vector<Projection> projections_;
 };
 
@@ -100,15 +100,15 @@ struct ForceNorms {
 // What a node sees of the bodies: the nearest, or, in a corner, the fillet between two or three.
 struct BodyContact {
   Gap gap;
-  int body = -1;                      // -1: none
-  std::array<int, 2> others{-1, -1};  // the same
-  std::array<double, 2> share{};      // of the others in what bears
+  int body = -1;                          // -1: none
+  std::array<int, 2> neighbours{-1, -1};  // the same
+  std::array<double, 2> weights{};        // of the neighbours in what bears
 
   template <class Of>
   auto mean(const Of& of) const {
     const auto own = of(body);
     auto out = own;
-    for (int k = 0; k < 2 && others[k] >= 0; ++k) out += share[k] * (of(others[k]) - own);
+    for (int k = 0; k < 2 && neighbours[k] >= 0; ++k) out += weights[k] * (of(neighbours[k]) - own);
     return out;
   }
 };

@@ -22,7 +22,7 @@ struct ContactMaterials {
   // the earlier, keep. Where sheets lie flat on each other, these pairs are redundant to those of
   // the earlier sheet's vertices: the active set is not unique and changes all the time. With less
   // than 1 they are active where cloth is curved only.
-  double edge_share = 1.0, second_share = 1.0;
+  double edge_fraction = 1.0, second_fraction = 1.0;
 
   double mean(int a, int b) const { return 0.5 * (thickness[a] + thickness[b]); }
   // Distance that pairs of closest points keep, m. Nodes touch surfaces by themselves
@@ -33,11 +33,11 @@ struct ContactMaterials {
   // The same by kind of pair; `first` and `second`: sheets of its pieces.
   double rest_distance(PairKind kind, int first, int second) const {
     const bool other = first != second && std::max(first, second) < sheets;
-    const double share = !other                        ? 1.0
-                         : kind == PairKind::edge_edge ? edge_share
-                         : first > second              ? second_share
-                                                       : 1.0;
-    return share * rest_distance(first, second);
+    const double fraction = !other                        ? 1.0
+                            : kind == PairKind::edge_edge ? edge_fraction
+                            : first > second              ? second_fraction
+                                                          : 1.0;
+    return fraction * rest_distance(first, second);
   }
   // The largest of these; without any, the largest thickness of a sheet.
   double farthest() const {

@@ -82,7 +82,7 @@ def test_weights_of_a_corner_are_exactly_zero(edges: bool) -> None:
 
 @KINDS
 @pytest.mark.parametrize("most", [np.inf, 0.5])
-def test_safe_share_keeps_the_distance_and_is_not_timid(edges: bool, most: float) -> None:
+def test_safe_fraction_keeps_the_distance_and_is_not_timid(edges: bool, most: float) -> None:
     rng = np.random.default_rng(3)
     ways = np.linspace(0.0, 1.0, 400)
     stopped = 0
@@ -92,7 +92,7 @@ def test_safe_share_keeps_the_distance_and_is_not_timid(edges: bool, most: float
         if start < 1e-4:
             continue
         to = x + rng.normal(size=(4, 3)) * rng.choice([0.1, 1.0, 10.0]) + rng.normal(size=3) * 10.0
-        safe, least = core.safe_share(edges, x, to, keep, most), keep * min(start, most)
+        safe, least = core.safe_fraction(edges, x, to, keep, most), keep * min(start, most)
         along = np.array([distance(edges, x + s * (to - x)) for s in ways])
         inside = along[ways <= safe]
         assert inside.min() > 0.0
@@ -107,7 +107,7 @@ def test_safe_share_keeps_the_distance_and_is_not_timid(edges: bool, most: float
 
 
 @KINDS
-def test_safe_share_takes_nothing_of_a_small_distance(edges: bool) -> None:
+def test_safe_fraction_takes_nothing_of_a_small_distance(edges: bool) -> None:
     """Else halves of halves end at rounding, and what presses on is on the other side."""
     rng = np.random.default_rng(7)
     stopped = 0
@@ -117,7 +117,7 @@ def test_safe_share_takes_nothing_of_a_small_distance(edges: bool) -> None:
         if start < 1e-4:
             continue
         to = x + rng.normal(size=(4, 3))
-        safe = core.safe_share(edges, x, to, 0.5, np.inf, 2.0 * start)
+        safe = core.safe_fraction(edges, x, to, 0.5, np.inf, 2.0 * start)
         left = distance(edges, x + safe * (to - x))
         assert left >= start * (1.0 - 1e-9)
         stopped += safe < 1.0
@@ -125,7 +125,7 @@ def test_safe_share_takes_nothing_of_a_small_distance(edges: bool) -> None:
 
 
 @KINDS
-def test_safe_share_is_that_of_the_oracle(edges: bool) -> None:
+def test_safe_fraction_is_that_of_the_oracle(edges: bool) -> None:
     """Which leaves a tenth of the distance, too, and stops a little before."""
     rng = np.random.default_rng(4)
     oracle_of = ipctk.AdditiveCCD()
@@ -135,7 +135,7 @@ def test_safe_share_is_that_of_the_oracle(edges: bool) -> None:
         x = rng.normal(size=(4, 3))
         to = x + 3.0 * rng.normal(size=(4, 3))
         hit, time = find(*x, *to)
-        safe = core.safe_share(edges, x, to, 0.1, np.inf)
+        safe = core.safe_fraction(edges, x, to, 0.1, np.inf)
         assert hit == (safe < 1.0)
         if hit:
             hits += 1

@@ -104,9 +104,9 @@ NB_MODULE(_testing, m) {
       [](bool edges, const Four& x) { return closest_weights(kind_of(edges), four(x)); }, "edges"_a,
       "x"_a, "See contact/closest.hpp.");
   m.def(
-      "safe_share",
+      "safe_fraction",
       [](bool edges, const Four& x, const Four& to, double keep, double most, double floor) {
-        return safe_share(kind_of(edges), four(x), four(to), {keep, most, floor});
+        return safe_fraction(kind_of(edges), four(x), four(to), {keep, most, floor});
       },
       "edges"_a, "x"_a, "to"_a, "keep"_a, "most"_a, "floor"_a = 0.0, "See contact/closest.hpp.");
   m.def(
@@ -149,15 +149,15 @@ NB_MODULE(_testing, m) {
   m.def(
       "cap_motion",
       [](const Triangles& triangles, const Points3& from, const Points3& to, double thickness,
-         double margin) {
+         double skin) {
         Buffer<double> end = buffer_of(to);
-        CandidateSet near(surface_of(triangles, from), thickness, margin);
+        CandidateSet near(surface_of(triangles, from), thickness, skin);
         near.limit_by_ccd(buffer_of(from), end);
         Points3 out(to.rows(), 3);
         for (int i = 0; i < to.rows(); ++i) out.row(i) = at_node(end, i).transpose();
         return out;
       },
-      "triangles"_a, "start"_a, "end"_a, "thickness"_a, "margin"_a, "See contact/path.hpp.");
+      "triangles"_a, "start"_a, "end"_a, "thickness"_a, "skin"_a, "See contact/path.hpp.");
   m.def(
       "feet",
       [](const Triangles& triangles, const Points3& x, double crease, const Points3& points) {

@@ -46,7 +46,7 @@ class Seen:
     """Largest number of pairs of triangles that cross in a frame; 0 for cloth without self-contact.
     """
 
-    uneven_end: float | None = None
+    motion_error_end: float | None = None
     """Distance of what drives the cloth from an even motion in the last step, up to the last frame
     [m]. None: the last step ends there, or all of it counts.
     """
@@ -201,11 +201,11 @@ CHECKS = (
 
 
 def _uneven(seen: Seen) -> float:
-    uneven = seen.cloth.history.column("uneven")
+    motion_error = seen.cloth.history.column("motion_error")
     # Motion after the last frame is not shown, and is no fault of the frames.
-    if seen.uneven_end is not None:
-        uneven = np.append(uneven[:-1], seen.uneven_end)
-    return float(uneven.max(initial=0.0))
+    if seen.motion_error_end is not None:
+        motion_error = np.append(motion_error[:-1], seen.motion_error_end)
+    return float(motion_error.max(initial=0.0))
 
 
 def _unconverged(cloth: Cloth) -> float:
@@ -300,5 +300,5 @@ class Verdict:
     def _look(self) -> None:
         self._looked_at = self._cloth.total.newton
         # The last step may go beyond the last frame, and how bodies move there is no fault.
-        seen = Seen(self._cloth, self._cloth.positions[None], self._crossings, uneven_end=0.0)
+        seen = Seen(self._cloth, self._cloth.positions[None], self._crossings, motion_error_end=0.0)
         self.is_lost = self.is_lost or bool(failed(values(seen))[0])

@@ -9,7 +9,7 @@ import numpy as np
 from stickslip_sim_core._sim_core import StepReport
 from stickslip_sim_core.arrays import Floats
 
-_COLUMNS = ("duration", "contact_work", "flow", "unconverged", "missed", "uneven")
+_COLUMNS = ("duration", "contact_work", "flow", "unconverged", "missed", "motion_error")
 
 
 class StepHistory:
@@ -33,7 +33,7 @@ class StepHistory:
             extremes.flow,
             report.unconverged,
             report.missed,
-            report.uneven,
+            report.motion_error,
         )
         self._friction[self._steps, : len(extremes.friction)] = np.reshape(
             extremes.friction, (-1, 2)
@@ -62,7 +62,7 @@ class StepHistory:
         """Return a number of each step: (steps,).
 
         `duration` [s]; `contact_work` and `flow` [J], see `StepReport.seen`; `unconverged` and
-        `missed`, both 0 or 1; `uneven` [m], see `StepReport`.
+        `missed`, both 0 or 1; `motion_error` [m], see `StepReport`.
         """
         return self._rows[: self._steps, _COLUMNS.index(name)]
 

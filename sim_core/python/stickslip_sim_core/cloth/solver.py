@@ -112,7 +112,7 @@ class Cloth:
         self._surface_sizes = sizes = [len(surface.at(self.time)) for surface in self.surfaces]
         corners = [np.asarray(surface.triangles) for surface in self.surfaces]
         mu, thickness = self._touch(sheets)
-        edge_share, second_share = BEARING[self_contact.bearing if self_contact else "all"]
+        edge_fraction, second_fraction = BEARING[self_contact.bearing if self_contact else "all"]
         # The lightest fabric gives the smallest unit, so no sheet converges too early.
         patch_weight = (
             min((fabric.density for fabric in self.fabrics), default=np.nan)
@@ -138,8 +138,8 @@ class Cloth:
             kernel=os.environ.get(KERNEL_VARIABLE, "") if kernel is None else kernel,
             thickness=thickness.tolist(),
             mu=mu,
-            edge_share=edge_share,
-            second_share=second_share,
+            edge_fraction=edge_fraction,
+            second_fraction=second_fraction,
             # Shift the numbers of a surface's vertices past the vertices of earlier surfaces.
             surface_triangles=np.concatenate(
                 [np.empty((0, 3), np.int32), *(c + sum(sizes[:s]) for s, c in enumerate(corners))],

@@ -152,9 +152,9 @@ int krylov(const ClothMatrix& matrix, const Factor& factor, const ContactRows& c
   admit(contact, matrix.nodes, x);
   if (product(x, x, count) > 0.0) {
     apply_contact(matrix, contact, x, images);
-    const float share = float(product(basis, images, count) / product(images, images, count));
-    for (long i = 0; i < count; ++i) x[i] *= share;
-    add_multiple(basis, -share, images, count);
+    const float scale = float(product(basis, images, count) / product(images, images, count));
+    for (long i = 0; i < count; ++i) x[i] *= scale;
+    add_multiple(basis, -scale, images, count);
     left = __builtin_sqrt(product(basis, basis, count));
   }
   if (!(left > tolerance * size)) return 0;

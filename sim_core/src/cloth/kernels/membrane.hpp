@@ -76,7 +76,7 @@ inline void add_lag(StretchLaw& law, const Lane* lag, const Strained& now) {
       law.qq += lag[8];
 }
 
-void membrane_lag(const MembraneData& data, const double* x, double share, double* lag) {
+void membrane_lag(const MembraneData& data, const double* x, double fraction, double* lag) {
   for (int group = 0; group < data.groups; ++group) {
     const int fabric = data.fabric[group];
     const Strained now = strained(data, group, x);
@@ -87,12 +87,12 @@ void membrane_lag(const MembraneData& data, const double* x, double share, doubl
     const Lane entries[9] = {now.a,
                              now.h,
                              now.q,
-                             share * (positive.aa - law.aa),
-                             share * (positive.ah - law.ah),
-                             share * (positive.aq - law.aq),
-                             share * (positive.hh - law.hh),
-                             share * (positive.hq - law.hq),
-                             share * (positive.qq - law.qq)};
+                             fraction * (positive.aa - law.aa),
+                             fraction * (positive.ah - law.ah),
+                             fraction * (positive.aq - law.aq),
+                             fraction * (positive.hh - law.hh),
+                             fraction * (positive.hq - law.hq),
+                             fraction * (positive.qq - law.qq)};
     for (int i = 0; i < 9; ++i)
       *reinterpret_cast<Lane*>(lag + (9L * group + i) * membrane_lanes) = entries[i];
   }
