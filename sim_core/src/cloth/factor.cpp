@@ -1,6 +1,7 @@
 #include "cloth/factor.hpp"
 
 #include <algorithm>
+#include <iterator>
 
 namespace sim_core {
 namespace {
@@ -58,6 +59,74 @@ struct Shelf {
   }
 };
 
+long pad(long rows) { return (rows + front_padding - 1) / front_padding * front_padding; }
+
+// The nodes of a front: pivots, and the rows below them, ascending.
+struct FrontNodes {
+  int first, last;  // pivots
+  std::vector<int> rows;
+
+  int pivots() const { return last - first; }
+  // Place of a node among the pivots and then the rows.
+  int place(int node) const {
+    if (node < last) return node - first;
+    return pivots() +
+           static_cast<int>(std::lower_bound(rows.begin(), rows.end(), node) - rows.begin());
+  }
+};
+
+void add_later(std::vector<int>::const_iterator begin, std::vector<int>::const_iterator end,
+               FrontNodes& front) {
+  std::copy_if(begin, end, std::back_inserter(front.rows),
+               [&](int node) { return node >= front.last; });
+}
+
+// Rows are the nodes after the pivots that a pivot, or a row of a child, is coupled to.
+FrontNodes front_nodes(int first, int last, const Pattern& bending,
+                       const std::vector<int>& children, const std::vector<FrontNodes>& fronts) {
+  FrontNodes front{first, last, {}};
+  add_later(bending.node.begin() + bending.begin[first], bending.node.begin() + bending.begin[last],
+            front);
+  for (int child : children) add_later(fronts[child].rows.begin(), fronts[child].rows.end(), front);
+  std::sort(front.rows.begin(), front.rows.end());
+  front.rows.erase(std::unique(front.rows.begin(), front.rows.end()), front.rows.end());
+  return front;
+}
+
+// Runs of a child's rows that lie together in its parent.
+std::vector<FrontRun> runs_in_parent(const FrontNodes& child, const FrontNodes& parent) {
+  std::vector<FrontRun> runs;
+  for (int r = 0; r < static_cast<int>(child.rows.size()); ++r) {
+    const int place = parent.place(child.rows[r]);
+    // A run does not lead from the pivots to the other rows, which are padded apart.
+    const bool goes_on =
+        !runs.empty() && place == runs.back().place + runs.back().count && place != parent.pivots();
+    if (goes_on) {
+      ++runs.back().count;
+    } else {
+      runs.push_back({r, 1, place});
+    }
+  }
+  return runs;
+}
+
+// What of the matrix comes into a front: its columns, from the diagonal down.
+void add_entries(const FrontNodes& front, const Pattern& bending, const Pattern& membrane,
+                 FactorStorage& storage) {
+  for (int j = front.first; j < front.last; ++j) {
+    for (int e = bending.begin[j]; e < bending.begin[j + 1]; ++e) {
+      const int i = bending.node[e];
+      if (i < j) continue;
+      storage.entry_slot.push_back(e);
+      // Column j of the front holds K_ij: the block in row i of the matrix.
+      storage.entry_block.push_back(membrane.slot(i, j));
+      storage.entry_row.push_back(front.place(i));
+      storage.entry_column.push_back(j - front.first);
+    }
+  }
+  storage.entry_begin.push_back(static_cast<long>(storage.entry_slot.size()));
+}
+
 }  // namespace
 
 FactorStorage::FactorStorage(const Pattern& bending, const Pattern& membrane,
@@ -67,10 +136,11 @@ FactorStorage::FactorStorage(const Pattern& bending, const Pattern& membrane,
       work(piece.size(), 0.0),
       pivot_begin(dissection.pivot_begin) {
   const int fronts = static_cast<int>(dissection.parent.size());
-  std::vector<std::vector<int>> structure(fronts), below(fronts);
+  std::vector<std::vector<int>> below(fronts);
   for (int f = 0; f < fronts; ++f) {
     if (dissection.parent[f] >= 0) below[dissection.parent[f]].push_back(f);
   }
+  std::vector<FrontNodes> nodes;
   std::vector<std::vector<FrontRun>> runs_of(fronts);
   row_begin.push_back(0);
   entry_begin.push_back(0);
@@ -78,64 +148,25 @@ FactorStorage::FactorStorage(const Pattern& bending, const Pattern& membrane,
   child_begin.push_back(0);
   Shelf shelf;
   long update_floats = 0, panel_max = 0, local_max = 0;
-  const auto pad = [](long rows) {
-    return (rows + front_padding - 1) / front_padding * front_padding;
-  };
   for (int f = 0; f < fronts; ++f) {
-    const int first = pivot_begin[f], last = pivot_begin[f + 1];
-    std::vector<int>& front_rows = structure[f];
-    for (int i = first; i < last; ++i) {
-      for (int e = bending.begin[i]; e < bending.begin[i + 1]; ++e) {
-        if (bending.node[e] >= last) front_rows.push_back(bending.node[e]);
-      }
-    }
-    for (int child : below[f]) {
-      for (int j : structure[child]) {
-        if (j >= last) front_rows.push_back(j);
-      }
-    }
-    std::sort(front_rows.begin(), front_rows.end());
-    front_rows.erase(std::unique(front_rows.begin(), front_rows.end()), front_rows.end());
-    rows.insert(rows.end(), front_rows.begin(), front_rows.end());
+    nodes.push_back(front_nodes(pivot_begin[f], pivot_begin[f + 1], bending, below[f], nodes));
+    const FrontNodes& front = nodes.back();
+    rows.insert(rows.end(), front.rows.begin(), front.rows.end());
     row_begin.push_back(static_cast<int>(rows.size()));
-    const auto place = [&](int node) {
-      return node < last ? node - first
-                         : last - first +
-                               static_cast<int>(
-                                   std::lower_bound(front_rows.begin(), front_rows.end(), node) -
-                                   front_rows.begin());
-    };
-    for (int child : below[f]) {
-      const std::vector<int>& theirs = structure[child];
-      for (int r = 0; r < static_cast<int>(theirs.size()); ++r) {
-        const int at = place(theirs[r]);
-        std::vector<FrontRun>& out = runs_of[child];
-        // A run does not lead from the pivots to the other rows, which are padded apart.
-        if (!out.empty() && at == out.back().place + out.back().count && at != last - first) {
-          ++out.back().count;
-        } else {
-          out.push_back({r, 1, at});
-        }
-      }
-    }
-    for (int j = first; j < last; ++j) {
-      for (int e = bending.begin[j]; e < bending.begin[j + 1]; ++e) {
-        const int i = bending.node[e];
-        if (i < j) continue;
-        entry_slot.push_back(e);
-        // Column j of the front holds K_ij: the block in row i of the matrix.
-        entry_block.push_back(membrane.slot(i, j));
-        entry_row.push_back(place(i));
-        entry_column.push_back(j - first);
-      }
-    }
-    entry_begin.push_back(static_cast<long>(entry_slot.size()));
-    const long columns = 3L * (last - first), rows = 3L * static_cast<long>(front_rows.size());
-    const long ld = pad(columns) + pad(rows);
-    tile_begin.push_back(tile_begin.back() + front_floats(columns, rows));
-    panel_max = std::max(panel_max, ld * columns);
-    local_max = std::max(local_max, columns + rows);
-    const long update = pad(rows) * rows;
+    for (int child : below[f]) runs_of[child] = runs_in_parent(nodes[child], front);
+    add_entries(front, bending, membrane, *this);
+
+    const long columns = 3L * front.pivots(),
+               row_floats = 3L * static_cast<long>(front.rows.size());
+    tile_begin.push_back(tile_begin.back() + front_floats(columns, row_floats));
+    panel_max = std::max(panel_max, (pad(columns) + pad(row_floats)) * columns);
+    local_max = std::max(local_max, columns + row_floats);
+    for (long c = 0; c < columns; ++c)
+      work[f] += static_cast<double>(columns - c + row_floats) * (columns - c + row_floats);
+
+    // The update of a piece stays, for its parent may be made anew without it. Others lie on a
+    // shelf, until their parents have taken them.
+    const long update = pad(row_floats) * row_floats;
     if (piece[f] == f) {
       update_begin.push_back(update_floats);
       update_floats += update;
@@ -147,8 +178,6 @@ FactorStorage::FactorStorage(const Pattern& bending, const Pattern& membrane,
     }
     children.insert(children.end(), below[f].begin(), below[f].end());
     child_begin.push_back(static_cast<int>(children.size()));
-    for (long c = 0; c < columns; ++c)
-      work[f] += static_cast<double>(columns - c + rows) * (columns - c + rows);
   }
   run_begin.push_back(0);
   for (const std::vector<FrontRun>& front_runs : runs_of) {

@@ -139,6 +139,10 @@ class PairFactor {
   void collect(const ContactSet& pairs, int free_nodes);
   int compare(const Assembly& assembly, const ContactState& contact);
   int missing(const ContactState& contact) const;
+  Graph graph_of(const Pattern& pattern) const;
+  Dissection dissect(const Graph& bending, const Buffer<double>& x) const;
+  std::vector<std::array<int, 2>> slots_of(const Pattern& from, const Pattern& to,
+                                           bool lower) const;
   void order(const Assembly& assembly, const Buffer<double>& x, const ContactState& contact,
              const ContactSet& pairs);
   void enter(bool whole);

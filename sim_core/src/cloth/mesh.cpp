@@ -109,6 +109,30 @@ SlopeFit mean_slope(const ClothMesh& mesh, const ClothMesh::Edge& edge, const Ve
   return fit;
 }
 
+void check_corners(const Points2& rest, const Triangles& triangles, Eigen::Index t) {
+  for (int c = 0; c < 3; ++c) {
+    const int v = triangles(t, c);
+    if (v >= 0 && v < rest.rows()) continue;
+    refuse(text("triangles: must index ", rest.rows(), " vertices, got ", v, " in triangle ", t));
+  }
+}
+
+// Of a triangle at rest, m^2.
+double checked_area(const Points2& rest, const Triangles& triangles, Eigen::Index t) {
+  const Vector2d p = rest.row(triangles(t, 0)), u = rest.row(triangles(t, 1)).transpose() - p,
+                 v = rest.row(triangles(t, 2)).transpose() - p;
+  const double area = 0.5 * (u.x() * v.y() - u.y() * v.x());
+  const double longest = std::max({u.squaredNorm(), v.squaredNorm(), (u - v).squaredNorm()});
+  if (!(area > 1e-3 * longest)) {
+    refuse(
+        text("triangles: must run counter-clockwise and not be slivers (area over longest edge "
+             "squared > 0.001), "
+             "and triangle ",
+             t, " has ", area / longest));
+  }
+  return area;
+}
+
 }  // namespace
 
 ClothMesh::ClothMesh(Points2 rest_in, Triangles triangles_in)
@@ -119,47 +143,34 @@ ClothMesh::ClothMesh(Points2 rest_in, Triangles triangles_in)
     if (!rest.row(v).allFinite()) refuse(text("rest: must be finite, and vertex ", v, " is not"));
   }
   triangle_edges.resize(triangles.rows());
-  std::map<std::pair<int, int>, int> known;
+  EdgeNumbers numbers;
   std::vector<char> used(rest.rows(), 0);
   for (Eigen::Index t = 0; t < triangles.rows(); ++t) {
-    for (int c = 0; c < 3; ++c) {
-      const int v = triangles(t, c);
-      if (v < 0 || v >= rest.rows()) {
-        refuse(
-            text("triangles: must index ", rest.rows(), " vertices, got ", v, " in triangle ", t));
-      }
-      used[v] = 1;
-    }
-    const Vector2d p = rest.row(triangles(t, 0)), u = rest.row(triangles(t, 1)).transpose() - p,
-                   v = rest.row(triangles(t, 2)).transpose() - p;
-    area[t] = 0.5 * (u.x() * v.y() - u.y() * v.x());
-    const double longest = std::max({u.squaredNorm(), v.squaredNorm(), (u - v).squaredNorm()});
-    if (!(area[t] > 1e-3 * longest)) {
-      refuse(
-          text("triangles: must run counter-clockwise and not be slivers (area over longest edge "
-               "squared > 0.001), "
-               "and triangle ",
-               t, " has ", area[t] / longest));
-    }
-    for (int c = 0; c < 3; ++c) {
-      const int i = triangles(t, (c + 1) % 3), j = triangles(t, (c + 2) % 3);
-      const auto [at, fresh] =
-          known.try_emplace({std::min(i, j), std::max(i, j)}, static_cast<int>(edges.size()));
-      if (fresh) edges.push_back({std::min(i, j), std::max(i, j)});
-      Edge& edge = edges[at->second];
-      const int side = edge.triangle[0] < 0 ? 0 : 1;
-      if (edge.triangle[side] >= 0)
-        refuse(text("triangles: edge (", i, ", ", j, ") must belong to at most two"));
-      edge.triangle[side] = static_cast<int>(t);
-      edge.corner[side] = c;
-      triangle_edges[t][c] = at->second;
-    }
+    check_corners(rest, triangles, t);
+    for (int c = 0; c < 3; ++c) used[triangles(t, c)] = 1;
+    area[t] = checked_area(rest, triangles, t);
+    for (int c = 0; c < 3; ++c) add_edge(numbers, static_cast<int>(t), c);
   }
   for (Eigen::Index v = 0; v < rest.rows(); ++v) {
     if (!used[v])
       refuse(text("rest: every vertex must belong to a triangle, and ", v, " does not"));
   }
   find_sheets();
+}
+
+// Enters the edge opposite a corner of a triangle.
+void ClothMesh::add_edge(EdgeNumbers& numbers, int t, int corner) {
+  const int i = triangles(t, (corner + 1) % 3), j = triangles(t, (corner + 2) % 3);
+  const auto [at, fresh] =
+      numbers.try_emplace({std::min(i, j), std::max(i, j)}, static_cast<int>(edges.size()));
+  if (fresh) edges.push_back({std::min(i, j), std::max(i, j)});
+  Edge& edge = edges[at->second];
+  const int side = edge.triangle[0] < 0 ? 0 : 1;
+  if (edge.triangle[side] >= 0)
+    refuse(text("triangles: edge (", i, ", ", j, ") must belong to at most two"));
+  edge.triangle[side] = t;
+  edge.corner[side] = corner;
+  triangle_edges[t][corner] = at->second;
 }
 
 void ClothMesh::find_sheets() {
@@ -178,6 +189,49 @@ void ClothMesh::find_sheets() {
   }
 }
 
+namespace {
+
+// Calls with the key of each cell of side `size` that a box meets; different cells may share one.
+template <class Call>
+void visit_cells(const Eigen::AlignedBox3d& box, double size, const Call& call) {
+  const auto key = [](std::int64_t x, std::int64_t y, std::int64_t z) {
+    return x * 73856093 ^ y * 19349663 ^ z * 83492791;
+  };
+  const Eigen::Array3d from = (box.min() / size).array().floor(),
+                       to = (box.max() / size).array().floor();
+  for (double x = from[0]; x <= to[0]; ++x) {
+    for (double y = from[1]; y <= to[1]; ++y) {
+      for (double z = from[2]; z <= to[2]; ++z)
+        call(key(std::int64_t(x), std::int64_t(y), std::int64_t(z)));
+    }
+  }
+}
+
+bool have_common_vertex(const Triangles& triangles, int t, int other) {
+  for (int i = 0; i < 3; ++i) {
+    for (int j = 0; j < 3; ++j) {
+      if (triangles(t, i) == triangles(other, j)) return true;
+    }
+  }
+  return false;
+}
+
+// Whether an edge of one triangle crosses the other.
+bool triangles_cross(const Points3& positions, const Triangles& triangles, int t, int other) {
+  Vector3d p[3], q[3];
+  for (int c = 0; c < 3; ++c) {
+    p[c] = positions.row(triangles(t, c)).transpose();
+    q[c] = positions.row(triangles(other, c)).transpose();
+  }
+  for (int c = 0; c < 3; ++c) {
+    if (crosses(p[c], p[(c + 1) % 3], q[0], q[1], q[2])) return true;
+    if (crosses(q[c], q[(c + 1) % 3], p[0], p[1], p[2])) return true;
+  }
+  return false;
+}
+
+}  // namespace
+
 int self_intersections(const Points3& positions, const Triangles& triangles) {
   const int count = static_cast<int>(triangles.rows());
   std::vector<Eigen::AlignedBox3d> box(count);
@@ -187,74 +241,60 @@ int self_intersections(const Points3& positions, const Triangles& triangles) {
     size += box[t].sizes().maxCoeff() / count;
   }
   if (!(size > 0.0) || !std::isfinite(size)) return 0;
-  // A hash of cells about as large as a triangle.
-  const auto key = [](std::int64_t x, std::int64_t y, std::int64_t z) {
-    return x * 73856093 ^ y * 19349663 ^ z * 83492791;
-  };
+
+  // A hash of cells about as large as a triangle, each with the triangles before t that meet it.
   std::unordered_map<std::int64_t, std::vector<int>> cells;
-  int found = 0;
-  std::vector<int> seen(count, -1);
+  int intersections = 0;
+  std::vector<int> compared_with(count, -1);
   for (int t = 0; t < count; ++t) {
-    const Eigen::Array3d from = (box[t].min() / size).array().floor(),
-                         to = (box[t].max() / size).array().floor();
-    for (double x = from[0]; x <= to[0]; ++x) {
-      for (double y = from[1]; y <= to[1]; ++y) {
-        for (double z = from[2]; z <= to[2]; ++z) {
-          std::vector<int>& cell = cells[key(std::int64_t(x), std::int64_t(y), std::int64_t(z))];
-          for (int other : cell) {
-            if (seen[other] == t) continue;
-            seen[other] = t;
-            if (!box[t].intersects(box[other])) continue;
-            bool common = false;
-            for (int i = 0; i < 3; ++i) {
-              for (int j = 0; j < 3; ++j) common = common || triangles(t, i) == triangles(other, j);
-            }
-            if (common) continue;
-            Vector3d p[3], q[3];
-            for (int c = 0; c < 3; ++c) {
-              p[c] = positions.row(triangles(t, c)).transpose();
-              q[c] = positions.row(triangles(other, c)).transpose();
-            }
-            bool hit = false;
-            for (int c = 0; c < 3 && !hit; ++c) {
-              hit = crosses(p[c], p[(c + 1) % 3], q[0], q[1], q[2]) ||
-                    crosses(q[c], q[(c + 1) % 3], p[0], p[1], p[2]);
-            }
-            found += hit;
-          }
-          cell.push_back(t);
-        }
+    visit_cells(box[t], size, [&](std::int64_t key) {
+      std::vector<int>& cell = cells[key];
+      for (int other : cell) {
+        if (compared_with[other] == t) continue;
+        compared_with[other] = t;
+        const bool may_cross =
+            box[t].intersects(box[other]) && !have_common_vertex(triangles, t, other);
+        intersections += may_cross && triangles_cross(positions, triangles, t, other);
       }
-    }
+      cell.push_back(t);
+    });
   }
-  return found;
+  return intersections;
 }
 
-std::vector<Stencil> bending_stencils(const ClothMesh& mesh, const Fabrics& fabrics, bool compact) {
-  const int count = static_cast<int>(mesh.triangles.rows());
-  std::vector<std::vector<int>> around(count);
+namespace {
+
+std::vector<std::vector<int>> triangles_beside(const ClothMesh& mesh) {
+  std::vector<std::vector<int>> beside(mesh.triangles.rows());
   for (const ClothMesh::Edge& edge : mesh.edges) {
     if (edge.boundary()) continue;
-    around[edge.triangle[0]].push_back(edge.triangle[1]);
-    around[edge.triangle[1]].push_back(edge.triangle[0]);
+    beside[edge.triangle[0]].push_back(edge.triangle[1]);
+    beside[edge.triangle[1]].push_back(edge.triangle[0]);
   }
+  return beside;
+}
+
+// The slope across each edge inside the mesh.
+std::vector<SlopeFit> slopes_of_edges(const ClothMesh& mesh, bool compact) {
+  const std::vector<std::vector<int>> beside = triangles_beside(mesh);
   std::vector<SlopeFit> slopes(mesh.edges.size());
   for (std::size_t e = 0; e < mesh.edges.size(); ++e) {
     const ClothMesh::Edge& edge = mesh.edges[e];
     if (edge.boundary()) continue;
     const Vector2d along = (mesh.rest.row(edge.b) - mesh.rest.row(edge.a)).transpose();
     slopes[e] = compact ? mean_slope(mesh, edge, normal_of(along))
-                        : fit_slope(mesh, around, edge, normal_of(along));
+                        : fit_slope(mesh, beside, edge, normal_of(along));
   }
-  std::vector<Stencil> stencils(count);
-  for (int t = 0; t < count; ++t) {
-    std::map<int, Eigen::Vector3d> entries;
-    const auto add = [&](int node, const Eigen::Vector3d& weight) {
-      const auto [at, fresh] = entries.try_emplace(node, Eigen::Vector3d::Zero());
-      at->second += weight;
-    };
-    Vector2d p[3], normal[3], gradient[3];
-    double length[3];
+  return slopes;
+}
+
+// The sides of a triangle at rest, opposite its corners.
+struct Sides {
+  Vector2d normal[3], gradient[3];  // outward, and of the height over the side, 1/m
+  double length[3];                 // m
+
+  Sides(const ClothMesh& mesh, int t) {
+    Vector2d p[3];
     for (int c = 0; c < 3; ++c) p[c] = mesh.rest.row(mesh.triangles(t, c));
     for (int c = 0; c < 3; ++c) {
       const Vector2d along = p[(c + 2) % 3] - p[(c + 1) % 3];
@@ -262,40 +302,66 @@ std::vector<Stencil> bending_stencils(const ClothMesh& mesh, const Fabrics& fabr
       normal[c] = normal_of(along);  // outward: the triangle runs counter-clockwise
       gradient[c] = -normal[c] * length[c] / (2.0 * mesh.area[t]);
     }
-    std::vector<Eigen::Vector3d> open;
-    for (int c = 0; c < 3; ++c) {
-      const int e = mesh.triangle_edges[t][c];
-      const ClothMesh::Edge& edge = mesh.edges[e];
-      const Eigen::Vector3d direction =
-          length[c] / mesh.area[t] *
-          Eigen::Vector3d(normal[c].x() * normal[c].x(), normal[c].y() * normal[c].y(),
-                          2.0 * normal[c].x() * normal[c].y());
-      if (edge.boundary()) {
-        open.push_back(direction);
-        continue;
-      }
-      const Vector2d along = (mesh.rest.row(edge.b) - mesh.rest.row(edge.a)).transpose();
-      const double sign = normal_of(along).dot(normal[c]) > 0.0 ? 1.0 : -1.0;
-      for (std::size_t i = 0; i < slopes[e].nodes.size(); ++i) {
-        add(slopes[e].nodes[i], sign * slopes[e].weights[i] * direction);
-      }
-      for (int i = 0; i < 3; ++i)
-        add(mesh.triangles(t, i), -normal[c].dot(gradient[i]) * direction);
-    }
-    Eigen::Matrix3d project = Eigen::Matrix3d::Identity();
-    if (!open.empty()) {
-      const Rigidity& rigidity = fabrics.at(t).rigidity;
-      Eigen::MatrixXd n(3, open.size());
-      for (std::size_t i = 0; i < open.size(); ++i) n.col(i) = open[i];
-      project -= n * (n.transpose() * rigidity * n).ldlt().solve(n.transpose() * rigidity);
-    }
-    Stencil& stencil = stencils[t];
-    stencil.weights.resize(entries.size(), 3);
-    for (const auto& [node, weight] : entries) {
-      stencil.weights.row(stencil.nodes.size()) = (project * weight).transpose();
-      stencil.nodes.push_back(node);
-    }
   }
+};
+
+// What takes curvature across open sides, `open`, out of a triangle's: no moment acts on them.
+Eigen::Matrix3d without_moments(const std::vector<Eigen::Vector3d>& open,
+                                const Rigidity& rigidity) {
+  Eigen::Matrix3d project = Eigen::Matrix3d::Identity();
+  if (open.empty()) return project;
+  Eigen::MatrixXd n(3, open.size());
+  for (std::size_t i = 0; i < open.size(); ++i) n.col(i) = open[i];
+  project -= n * (n.transpose() * rigidity * n).ldlt().solve(n.transpose() * rigidity);
+  return project;
+}
+
+Stencil bending_stencil(const ClothMesh& mesh, const Rigidity& rigidity,
+                        const std::vector<SlopeFit>& slopes, int t) {
+  std::map<int, Eigen::Vector3d> entries;
+  const auto add = [&](int node, const Eigen::Vector3d& weight) {
+    const auto [at, fresh] = entries.try_emplace(node, Eigen::Vector3d::Zero());
+    at->second += weight;
+  };
+  const Sides sides(mesh, t);
+  std::vector<Eigen::Vector3d> open;
+  for (int c = 0; c < 3; ++c) {
+    const int e = mesh.triangle_edges[t][c];
+    const ClothMesh::Edge& edge = mesh.edges[e];
+    const Vector2d& normal = sides.normal[c];
+    const Eigen::Vector3d direction =
+        sides.length[c] / mesh.area[t] *
+        Eigen::Vector3d(normal.x() * normal.x(), normal.y() * normal.y(),
+                        2.0 * normal.x() * normal.y());
+    if (edge.boundary()) {
+      open.push_back(direction);
+      continue;
+    }
+    const Vector2d along = (mesh.rest.row(edge.b) - mesh.rest.row(edge.a)).transpose();
+    const double sign = normal_of(along).dot(normal) > 0.0 ? 1.0 : -1.0;
+    for (std::size_t i = 0; i < slopes[e].nodes.size(); ++i) {
+      add(slopes[e].nodes[i], sign * slopes[e].weights[i] * direction);
+    }
+    for (int i = 0; i < 3; ++i)
+      add(mesh.triangles(t, i), -normal.dot(sides.gradient[i]) * direction);
+  }
+  const Eigen::Matrix3d project = without_moments(open, rigidity);
+  Stencil stencil;
+  stencil.weights.resize(entries.size(), 3);
+  for (const auto& [node, weight] : entries) {
+    stencil.weights.row(stencil.nodes.size()) = (project * weight).transpose();
+    stencil.nodes.push_back(node);
+  }
+  return stencil;
+}
+
+}  // namespace
+
+std::vector<Stencil> bending_stencils(const ClothMesh& mesh, const Fabrics& fabrics, bool compact) {
+  const std::vector<SlopeFit> slopes = slopes_of_edges(mesh, compact);
+  std::vector<Stencil> stencils;
+  for (int t = 0; t < static_cast<int>(mesh.triangles.rows()); ++t)
+    stencils.push_back(bending_stencil(mesh, fabrics.at(t).rigidity, slopes, t));
   return stencils;
 }
 

@@ -4,6 +4,7 @@
 #include <Eigen/Core>
 #include <array>
 #include <cstdint>
+#include <map>
 #include <utility>
 #include <vector>
 
@@ -38,6 +39,8 @@ struct ClothMesh {
   ClothMesh(Points2 rest, Triangles triangles);
 
  private:
+  using EdgeNumbers = std::map<std::pair<int, int>, int>;  // by the lower and the higher vertex
+  void add_edge(EdgeNumbers& numbers, int t, int corner);
   void find_sheets();
 };
 

@@ -118,44 +118,39 @@ bool PairFactor::has_place(const Entry& entry) const {
   return all;
 }
 
-void PairFactor::order(const Assembly& assembly, const Buffer<double>& x,
-                       const ContactState& contact, const ContactSet& pairs) {
-  const Numbering& numbering = assembly.numbering;
-  const int free_nodes = numbering.free_nodes;
-  pinned_.resize(free_nodes);
-  for (int i = 0; i < free_nodes; ++i) pinned_[i] = contact.mode[i] == contact_stick;
-  collect(pairs, free_nodes);
-  const auto graph_of = [&](const Pattern& pattern) {
-    Graph graph(free_nodes);
-    for (int i = 0; i < free_nodes; ++i) {
-      if (pinned_[i]) {
-        graph[i] = {i};
-        continue;
-      }
-      for (int e = pattern.begin[i]; e < pattern.begin[i + 1]; ++e) {
-        if (!pinned_[pattern.node[e]]) graph[i].push_back(pattern.node[e]);
-      }
+// Which loose nodes a pattern or an active pair couples. Pinned nodes are coupled to themselves
+// only.
+Graph PairFactor::graph_of(const Pattern& pattern) const {
+  Graph graph(pinned_.size());
+  for (std::size_t i = 0; i < pinned_.size(); ++i) {
+    if (pinned_[i]) {
+      graph[i] = {static_cast<int>(i)};
+      continue;
     }
-    for (const Entry& entry : wanted_) {
-      for (int a : entry.node) {
-        for (int b : entry.node) {
-          if (a >= 0 && b >= 0) graph[a].push_back(b);
-        }
+    for (int e = pattern.begin[i]; e < pattern.begin[i + 1]; ++e) {
+      if (!pinned_[pattern.node[e]]) graph[i].push_back(pattern.node[e]);
+    }
+  }
+  for (const Entry& entry : wanted_) {
+    for (int a : entry.node) {
+      for (int b : entry.node) {
+        if (a >= 0 && b >= 0) graph[a].push_back(b);
       }
     }
-    for (std::vector<int>& row : graph) {
-      std::sort(row.begin(), row.end());
-      row.erase(std::unique(row.begin(), row.end()), row.end());
-    }
-    return graph;
-  };
-  const Graph bending = graph_of(numbering.compact_bending),
-              membrane = graph_of(numbering.membrane);
-  // Pinned nodes come last, each for itself.
-  std::vector<int> loose, pins, number(free_nodes, -1);
-  for (int i = 0; i < free_nodes; ++i) {
+  }
+  for (std::vector<int>& row : graph) {
+    std::sort(row.begin(), row.end());
+    row.erase(std::unique(row.begin(), row.end()), row.end());
+  }
+  return graph;
+}
+
+// Of the loose nodes, where they are in space. Pinned nodes come last, a few in a front.
+Dissection PairFactor::dissect(const Graph& bending, const Buffer<double>& x) const {
+  std::vector<int> loose, pins, number(pinned_.size(), -1);
+  for (std::size_t i = 0; i < pinned_.size(); ++i) {
     number[i] = static_cast<int>(loose.size());
-    (pinned_[i] ? pins : loose).push_back(i);
+    (pinned_[i] ? pins : loose).push_back(static_cast<int>(i));
   }
   Graph coupled(loose.size());
   Eigen::MatrixXd points(loose.size(), 3);
@@ -171,6 +166,35 @@ void PairFactor::order(const Assembly& assembly, const Buffer<double>& x,
     dissection.pivot_begin.push_back(static_cast<int>(dissection.order.size()));
     dissection.parent.push_back(-1);
   }
+  return dissection;
+}
+
+// Where the entries of the assembly's pattern stand in one of places: those in the rows of the node
+// that is eliminated first, or with `lower` in those of the other.
+std::vector<std::array<int, 2>> PairFactor::slots_of(const Pattern& from, const Pattern& to,
+                                                     bool lower) const {
+  std::vector<std::array<int, 2>> slots;
+  for (int i = 0; i < from.rows(); ++i) {
+    for (int e = from.begin[i]; e < from.begin[i + 1]; ++e) {
+      const int row = place_[i], column = place_[from.node[e]];
+      if (lower ? column > row : column < row) continue;
+      const int slot = to.slot(row, column);
+      if (slot >= 0) slots.push_back({e, slot});
+    }
+  }
+  return slots;
+}
+
+void PairFactor::order(const Assembly& assembly, const Buffer<double>& x,
+                       const ContactState& contact, const ContactSet& pairs) {
+  const Numbering& numbering = assembly.numbering;
+  const int free_nodes = numbering.free_nodes;
+  pinned_.resize(free_nodes);
+  for (int i = 0; i < free_nodes; ++i) pinned_[i] = contact.mode[i] == contact_stick;
+  collect(pairs, free_nodes);
+  const Graph bending = graph_of(numbering.compact_bending),
+              membrane = graph_of(numbering.membrane);
+  const Dissection dissection = dissect(bending, x);
   order_ = dissection.order;
   place_.resize(free_nodes);
   for (int i = 0; i < free_nodes; ++i) place_[order_[i]] = i;
@@ -178,21 +202,8 @@ void PairFactor::order(const Assembly& assembly, const Buffer<double>& x,
   membrane_ = renumbered(membrane, order_, place_);
   // The factor reads a scalar in the row of the one that is eliminated first, and a block in that
   // of the other.
-  scalar_slots_.clear();
-  block_slots_.clear();
-  const auto find_slots = [&](const Pattern& from, const Pattern& to, bool upper,
-                              std::vector<std::array<int, 2>>& slots) {
-    for (int i = 0; i < free_nodes; ++i) {
-      for (int e = from.begin[i]; e < from.begin[i + 1]; ++e) {
-        const int row = place_[i], column = place_[from.node[e]];
-        if (upper ? column < row : column > row) continue;
-        const int slot = to.slot(row, column);
-        if (slot >= 0) slots.push_back({e, slot});
-      }
-    }
-  };
-  find_slots(numbering.compact_bending, bending_, true, scalar_slots_);
-  find_slots(numbering.membrane, membrane_, false, block_slots_);
+  scalar_slots_ = slots_of(numbering.compact_bending, bending_, false);
+  block_slots_ = slots_of(numbering.membrane, membrane_, true);
   scalars_.assign(bending_.node.size(), 0.0f);
   blocks_.assign(12 * membrane_.node.size(), 0.0f);
   diagonal_.resize(free_nodes);

@@ -134,6 +134,30 @@ Core core_of(const Body& body) {
   return {body.radius + less, {body.core[first] - less, body.core[second] - less}, axes};
 }
 
+namespace {
+
+// Whether a triangle passes a corner of a rectangle.
+bool passes_corners(const Core& core, const Corners& start, const Corners& end) {
+  for (const double u : {-core.half.x(), core.half.x()}) {
+    for (const double v : {-core.half.y(), core.half.y()}) {
+      if (std::isfinite(u) && passes_point(start, end, {u, v, 0.0})) return true;
+    }
+  }
+  return false;
+}
+
+bool passes_sides(const Core& core, const Corners& start, const Corners& end) {
+  for (int along = 0; along < 2; ++along) {
+    if (!(core.half[along] > 0.0)) continue;
+    for (const double sign : {-1.0, 1.0}) {
+      if (passes_segment(core, start, end, along, sign * core.half[1 - along])) return true;
+    }
+  }
+  return false;
+}
+
+}  // namespace
+
 bool passes(const Core& core, const Corners& start, const Corners& end) {
   Eigen::AlignedBox3d displacement;
   for (const Corners* at : {&start, &end}) {
@@ -143,21 +167,8 @@ bool passes(const Core& core, const Corners& start, const Corners& end) {
   if (!displacement.intersects({-half, half})) return false;
   const bool wide = core.half.y() > 0.0, thin = !(core.half.x() > 0.0) && !wide;
   if (thin) return passes_point(start, end, Vector3d::Zero());
-  const auto corners = [&] {
-    for (const double u : {-core.half.x(), core.half.x()}) {
-      for (const double v : {-core.half.y(), core.half.y()}) {
-        if (std::isfinite(u) && passes_point(start, end, {u, v, 0.0})) return true;
-      }
-    }
-    return false;
-  };
-  for (int along = 0; along < 2; ++along) {
-    if (!(core.half[along] > 0.0)) continue;
-    for (const double sign : {-1.0, 1.0}) {
-      if (passes_segment(core, start, end, along, sign * core.half[1 - along])) return true;
-    }
-  }
-  return corners() || (wide && passes_inside(core, start, end));
+  return passes_sides(core, start, end) || passes_corners(core, start, end) ||
+         (wide && passes_inside(core, start, end));
 }
 
 void refuse_sharp(const std::vector<Body>& bodies, double cell) {

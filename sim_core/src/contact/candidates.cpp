@@ -119,6 +119,53 @@ bool in_order(const Candidate& p, const Candidate& q) {
   return p.first != q.first ? p.first < q.first : p.second < q.second;
 }
 
+void add_vertices(const Surface& surface, const Buffer<double>& x, double reach,
+                  const std::vector<Box>& boxes, std::vector<Candidate>& out) {
+  const Grid grid(boxes);
+  for (const int vertex : surface.vertices) {
+    const int cell = grid.cell_at(at_node(x, vertex).array());
+    if (cell < 0) continue;
+    for (const int* t = grid.begin(cell); t < grid.end(cell); ++t) {
+      const auto& corner = surface.triangles[*t];
+      if (!boxes[*t].contains(at_node(x, vertex)) || !surface.may_touch(vertex, corner[0]))
+        continue;
+      if (std::find(corner.begin(), corner.end(), vertex) != corner.end()) continue;
+      add_if_near(
+          out,
+          {PairKind::vertex_triangle, vertex, *t, {vertex, corner[0], corner[1], corner[2]}, 0.0},
+          x, reach);
+    }
+  }
+}
+
+bool have_common_end(const std::array<int, 2>& a, const std::array<int, 2>& b) {
+  return a[0] == b[0] || a[0] == b[1] || a[1] == b[0] || a[1] == b[1];
+}
+
+void add_edges(const Surface& surface, const Buffer<double>& x, double reach,
+               const std::vector<Box>& boxes, std::vector<Candidate>& out) {
+  const Grid grid(boxes);
+  Around around;
+  for (int cell = 0; cell < grid.cells(); ++cell) {
+    const int *begin = grid.begin(cell), *end = grid.end(cell);
+    around.take(boxes, begin, end);
+    for (const int* i = begin; i < end; ++i) {
+      const auto& a = surface.edges[*i];
+      if (a[0] > surface.last_collider[surface.sheet_of_node[a[0]]])
+        continue;  // nothing beyond touches it
+      const std::vector<char>& meet = around.meeting(static_cast<int>(i - begin));
+      for (const int* j = i + 1; j < end; ++j) {
+        if (!meet[j - begin]) continue;
+        const auto& b = surface.edges[*j];
+        if (!surface.may_touch(a[0], b[0]) || have_common_end(a, b)) continue;
+        // Boxes that meet in many cells count in the one with the lowest corner of what they share.
+        if (grid.cell_at(boxes[*i].min().cwiseMax(boxes[*j].min()).array()) != cell) continue;
+        add_if_near(out, {PairKind::edge_edge, *i, *j, {a[0], a[1], b[0], b[1]}, 0.0}, x, reach);
+      }
+    }
+  }
+}
+
 }  // namespace
 
 FourPoints points_of(const Candidate& pair, const Buffer<double>& x) {
@@ -135,45 +182,11 @@ std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& 
       })) {
     return out;
   }
-  const Grid around_triangles(boxes);
-  for (const int vertex : surface.vertices) {
-    const int cell = around_triangles.cell_at(at_node(x, vertex).array());
-    if (cell < 0) continue;
-    for (const int* t = around_triangles.begin(cell); t < around_triangles.end(cell); ++t) {
-      const auto& corner = surface.triangles[*t];
-      if (!boxes[*t].contains(at_node(x, vertex)) || !surface.may_touch(vertex, corner[0]))
-        continue;
-      if (std::find(corner.begin(), corner.end(), vertex) != corner.end()) continue;
-      add_if_near(
-          out,
-          {PairKind::vertex_triangle, vertex, *t, {vertex, corner[0], corner[1], corner[2]}, 0.0},
-          x, reach);
-    }
-  }
+  add_vertices(surface, x, reach, boxes, out);
   const std::size_t vertex_pairs = out.size();
   boxes.clear();
   for (const auto& ends : surface.edges) boxes.push_back(box_of(ends, x, 0.5 * reach));
-  const Grid edges(boxes);
-  Around around;
-  for (int cell = 0; cell < edges.cells(); ++cell) {
-    const int *begin = edges.begin(cell), *end = edges.end(cell);
-    around.take(boxes, begin, end);
-    for (const int* i = begin; i < end; ++i) {
-      const auto& a = surface.edges[*i];
-      if (a[0] > surface.last_collider[surface.sheet_of_node[a[0]]])
-        continue;  // nothing beyond touches it
-      const std::vector<char>& meet = around.meeting(static_cast<int>(i - begin));
-      for (const int* j = i + 1; j < end; ++j) {
-        if (!meet[j - begin]) continue;
-        const auto& b = surface.edges[*j];
-        if (!surface.may_touch(a[0], b[0])) continue;
-        if (a[0] == b[0] || a[0] == b[1] || a[1] == b[0] || a[1] == b[1]) continue;
-        // Boxes that meet in many cells count in the one with the lowest corner of what they share.
-        if (edges.cell_at(boxes[*i].min().cwiseMax(boxes[*j].min()).array()) != cell) continue;
-        add_if_near(out, {PairKind::edge_edge, *i, *j, {a[0], a[1], b[0], b[1]}, 0.0}, x, reach);
-      }
-    }
-  }
+  add_edges(surface, x, reach, boxes, out);
   std::sort(out.begin() + static_cast<std::ptrdiff_t>(vertex_pairs), out.end(), in_order);
   return out;
 }

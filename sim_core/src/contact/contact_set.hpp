@@ -144,6 +144,9 @@ class ContactSet {
   Eigen::Vector3d slip(const Candidate& stencil, const Eigen::Vector4d& weights,
                        const Eigen::Vector3d& rho);
   void transfer(double step_length);
+  void inherit(Pair& pair, const PairPast& past, double step_length) const;
+  void adopt(const PairPast& orphan, const Eigen::Vector3d& force,
+             const std::vector<std::size_t>& fresh);
   void merge();
   void linearize_at(const Buffer<double>& x);
 

@@ -17,13 +17,17 @@ auto key(const Any& pair) {
   return std::make_tuple(pair.stencil.kind, pair.stencil.first, pair.feature);
 }
 
+// Whether two pairs have the same vertex, or one of their edges is the same.
+bool have_common_piece(const Candidate& a, const Candidate& b) {
+  if (a.kind != b.kind) return false;
+  if (a.kind == PairKind::vertex_triangle) return a.first == b.first;
+  return a.first == b.first || a.second == b.second || a.first == b.second || a.second == b.first;
+}
+
 }  // namespace
 
 // Transfers the forces of earlier pairs, with a step length along their last changes, to the pairs
-// at hand, both sorted by kind, first and feature. The force of a pair that is gone goes to the new
-// pair of the same vertex, or of one of its edges, whose normal is most alike: the closest feature
-// has changed; else to the nearest pair. Under the exact law the proximal stiffness of pairs that
-// stall grows.
+// at hand, both sorted by kind, first and feature.
 void ContactSet::transfer(double step_length) {
   std::vector<const PairPast*> orphans;
   std::vector<std::size_t> fresh;
@@ -31,18 +35,7 @@ void ContactSet::transfer(double step_length) {
   for (std::size_t i = 0; i < pairs_.size(); ++i) {
     for (; o < base_.size() && key(base_[o]) < key(pairs_[i]); ++o) orphans.push_back(&base_[o]);
     if (o < base_.size() && key(base_[o]) == key(pairs_[i])) {
-      pairs_[i].contact.force = base_[o].force + step_length * base_[o].change;
-      pairs_[i].penalty_scale = base_[o].penalty_scale;
-      const int mode = base_[o].mode;
-      const double last = base_[o].missed, now = violation(pairs_[i].contact, mode);
-      if (smoothing == 0.0 && step_length == 1.0 && mode != contact_open &&
-          last > pairs::length_tolerance && last < pairs::half_layer * pairs_[i].thickness &&
-          now > pairs::converging * last) {
-        pairs_[i].penalty_scale =
-            std::min(stiffness::growth * base_[o].penalty_scale, stiffness::growth_max);
-      }
-      pairs_[i].proximal.normal *= pairs_[i].penalty_scale;
-      pairs_[i].proximal.tangential *= pairs_[i].penalty_scale;
+      inherit(pairs_[i], base_[o], step_length);
       ++o;
     } else {
       fresh.push_back(i);
@@ -51,35 +44,49 @@ void ContactSet::transfer(double step_length) {
   for (; o < base_.size(); ++o) orphans.push_back(&base_[o]);
   for (const PairPast* orphan : orphans) {
     const Vector3d force = orphan->force + step_length * orphan->change;
-    if (force.isZero(0.0)) continue;
-    std::size_t match = pairs_.size();
-    double best = pairs::match_cosine;
-    for (std::size_t i : fresh) {
-      const Candidate &a = pairs_[i].stencil, &b = orphan->stencil;
-      if (a.kind != b.kind) continue;
-      const bool common = a.kind == PairKind::vertex_triangle
-                              ? a.first == b.first
-                              : a.first == b.first || a.second == b.second || a.first == b.second ||
-                                    a.second == b.first;
-      if (!common) continue;
-      const double alike = pairs_[i].contact.normal.dot(orphan->normal);
-      if (alike > best) best = alike, match = i;
-    }
-    if (match < pairs_.size()) {
-      pairs_[match].contact.force += force;
-      continue;
-    }
-    best = pairs::half_layer * orphan->thickness;
-    for (std::size_t i = 0; i < pairs_.size(); ++i) {
-      const double far = (pairs_[i].middle - orphan->middle).norm();
-      const double alike = pairs_[i].contact.normal.dot(orphan->normal);
-      if (far < best && std::abs(alike) > pairs::match_cosine) best = far, match = i;
-    }
-    if (match < pairs_.size()) {
-      pairs_[match].contact.force +=
-          pairs_[match].contact.normal.dot(orphan->normal) > 0.0 ? force : Vector3d(-force);
-    }
+    if (!force.isZero(0.0)) adopt(*orphan, force, fresh);
   }
+}
+
+// Gives a pair the force of the same pair before. Under the exact law the proximal stiffness of
+// pairs that stall grows: those that stay off by much of what they were off before.
+void ContactSet::inherit(Pair& pair, const PairPast& past, double step_length) const {
+  pair.contact.force = past.force + step_length * past.change;
+  pair.penalty_scale = past.penalty_scale;
+  const double now = violation(pair.contact, past.mode);
+  const bool is_exact = smoothing == 0.0 && step_length == 1.0 && past.mode != contact_open;
+  const bool was_near =
+      past.missed > pairs::length_tolerance && past.missed < pairs::half_layer * pair.thickness;
+  if (is_exact && was_near && now > pairs::converging * past.missed)
+    pair.penalty_scale = std::min(stiffness::growth * past.penalty_scale, stiffness::growth_max);
+  pair.proximal.normal *= pair.penalty_scale;
+  pair.proximal.tangential *= pair.penalty_scale;
+}
+
+// The force of a pair that is gone goes to the new pair of the same vertex, or of one of its edges,
+// whose normal is most alike: the closest feature has changed. Else it goes to the nearest pair.
+void ContactSet::adopt(const PairPast& orphan, const Vector3d& force,
+                       const std::vector<std::size_t>& fresh) {
+  Pair* match = nullptr;
+  double most_alike = pairs::match_cosine;
+  for (std::size_t i : fresh) {
+    if (!have_common_piece(pairs_[i].stencil, orphan.stencil)) continue;
+    const double alike = pairs_[i].contact.normal.dot(orphan.normal);
+    if (alike > most_alike) most_alike = alike, match = &pairs_[i];
+  }
+  if (match) {
+    match->contact.force += force;
+    return;
+  }
+  double nearest = pairs::half_layer * orphan.thickness;
+  for (Pair& pair : pairs_) {
+    const double far = (pair.middle - orphan.middle).norm();
+    const double alike = pair.contact.normal.dot(orphan.normal);
+    if (far < nearest && std::abs(alike) > pairs::match_cosine) nearest = far, match = &pair;
+  }
+  if (!match) return;
+  const bool has_same_side = match->contact.normal.dot(orphan.normal) > 0.0;
+  match->contact.force += has_same_side ? force : Vector3d(-force);
 }
 
 // Merges pairs at nearly the same place, as where a vertex lies on a vertex: their rows differ by

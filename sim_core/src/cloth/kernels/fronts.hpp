@@ -85,10 +85,13 @@ inline void subtract_columns(float* panel, long ld, int j, int width, int rows) 
   }
 }
 
-// Factor `width` columns of a panel from its diagonal down to `rows`, all earlier columns being
-// subtracted already.
-inline void factor_columns(float* panel, long ld, int width, int rows) {
+// The triangle of `width` columns on the diagonal, and the inverses of its pivots.
+struct DiagonalBlock {
   float l[tile_columns][tile_columns], inverse[tile_columns];
+};
+
+inline void factor_diagonal(const float* panel, long ld, int width, DiagonalBlock& block) {
+  auto& l = block.l;
   for (int j = 0; j < width; ++j) {
     float pivot = panel[j * ld + j];
     const float diagonal = pivot;
@@ -96,33 +99,51 @@ inline void factor_columns(float* panel, long ld, int width, int rows) {
     if (!(pivot > 1e-6f * diagonal))
       pivot = diagonal > 0.0f ? 1e-6f * diagonal : 1.0f;  // rounding: the factor may be inexact
     l[j][j] = __builtin_sqrtf(pivot);
-    inverse[j] = 1.0f / l[j][j];
+    block.inverse[j] = 1.0f / l[j][j];
     for (int i = j + 1; i < width; ++i) {
       float sum = panel[j * ld + i];
       for (int q = 0; q < j; ++q) sum -= l[i][q] * l[j][q];
-      l[i][j] = sum * inverse[j];
+      l[i][j] = sum * block.inverse[j];
     }
   }
-  const int below = (width + CLOTH_FLOATS - 1) / CLOTH_FLOATS * CLOTH_FLOATS;
-  for (int i = below; i < rows; i += CLOTH_FLOATS) {
+}
+
+// Rows from `begin` to `end`, in whole vectors and one by one.
+inline void factor_vectors(float* panel, long ld, int width, int begin, int end,
+                           const DiagonalBlock& block) {
+  for (int i = begin; i < end; i += CLOTH_FLOATS) {
     Floats v[tile_columns];
     for (int j = 0; j < width; ++j) {
       Floats sum = *reinterpret_cast<const Floats*>(panel + j * ld + i);
-      for (int q = 0; q < j; ++q) sum -= v[q] * l[j][q];
-      v[j] = sum * inverse[j];
+      for (int q = 0; q < j; ++q) sum -= v[q] * block.l[j][q];
+      v[j] = sum * block.inverse[j];
       *reinterpret_cast<Floats*>(panel + j * ld + i) = v[j];
     }
   }
-  // Rows between the block and the first whole vector.
-  for (int i = width; i < below && i < rows; ++i) {
+}
+
+inline void factor_rows(float* panel, long ld, int width, int begin, int end,
+                        const DiagonalBlock& block) {
+  for (int i = begin; i < end; ++i) {
     for (int j = 0; j < width; ++j) {
       float sum = panel[j * ld + i];
-      for (int q = 0; q < j; ++q) sum -= panel[q * ld + i] * l[j][q];
-      panel[j * ld + i] = sum * inverse[j];
+      for (int q = 0; q < j; ++q) sum -= panel[q * ld + i] * block.l[j][q];
+      panel[j * ld + i] = sum * block.inverse[j];
     }
   }
+}
+
+// Factor `width` columns of a panel from its diagonal down to `rows`, all earlier columns being
+// subtracted already.
+inline void factor_columns(float* panel, long ld, int width, int rows) {
+  DiagonalBlock block;
+  factor_diagonal(panel, ld, width, block);
+  const int below = (width + CLOTH_FLOATS - 1) / CLOTH_FLOATS * CLOTH_FLOATS;
+  factor_vectors(panel, ld, width, below, rows, block);
+  // Rows between the block and the first whole vector.
+  factor_rows(panel, ld, width, width, below < rows ? below : rows, block);
   for (int j = 0; j < width; ++j) {
-    for (int i = j; i < width; ++i) panel[j * ld + i] = l[i][j];
+    for (int i = j; i < width; ++i) panel[j * ld + i] = block.l[i][j];
   }
 }
 
@@ -176,32 +197,48 @@ inline void keep_rows(const float* from, Kept* to) {
   for (int v = 0; v < tile_rows; v += CLOTH_FLOATS) keep(wide(from + v), to + v);
 }
 
+// Rows below a block of columns, which stand in two parts of the panel: pivot rows, and the others.
+struct RowsBelow {
+  const float *upper, *lower;  // such that row i of the first column is upper[i] or lower[i]
+  int pivot_rows, end;
+
+  float at(long column_offset, int i) const {
+    if (i < pivot_rows) return upper[column_offset + i];
+    return i < end ? lower[column_offset + i] : 0.0f;
+  }
+};
+
+// A tile of rows of both parts, or of the last ones: padded with zeros.
+template <class Kept>
+inline void keep_mixed_tile(const RowsBelow& rows, long ld, int i, int width, Kept* tile) {
+  float padded[tile_rows];
+  for (int q = 0; q < width; ++q, tile += tile_rows) {
+    for (int r = 0; r < tile_rows; ++r) padded[r] = rows.at(q * ld, i + r);
+    keep_rows(padded, tile);
+  }
+}
+
 // Writes the tiles of a block of columns that is done.
 template <class Kept>
 inline void keep_tiles(const Factor& factor, const FrontSize& size, int j, int width, long begin) {
   Kept* tile = static_cast<Kept*>(factor.tiles) + begin;
   const int first = j + width, columns_left = size.columns - first,
             end = columns_left + 3 * size.rows;
-  float padded[tile_columns * tile_rows] = {};
-  invert_triangle(factor.panel + j * size.ld + j, size.ld, width, padded);
-  for (int q = 0; q < width; ++q, tile += tile_rows) keep_rows(padded + q * tile_rows, tile);
+  float inverse[tile_columns * tile_rows] = {};
+  invert_triangle(factor.panel + j * size.ld + j, size.ld, width, inverse);
+  for (int q = 0; q < width; ++q, tile += tile_rows) keep_rows(inverse + q * tile_rows, tile);
   // Pivot rows and other rows lie apart in the panel.
-  const float *upper = factor.panel + j * size.ld + first,
-              *lower = factor.panel + j * size.ld + size.pivot_rows - columns_left;
-  for (int i = 0; i < end; i += tile_rows) {
-    if (i + tile_rows <= columns_left || (i >= columns_left && i + tile_rows <= end)) {
-      const float* from = (i < columns_left ? upper : lower) + i;
-      for (int q = 0; q < width; ++q, from += size.ld, tile += tile_rows) keep_rows(from, tile);
+  const RowsBelow rows{factor.panel + j * size.ld + first,
+                       factor.panel + j * size.ld + size.pivot_rows - columns_left, columns_left,
+                       end};
+  for (int i = 0; i < end; i += tile_rows, tile += width * tile_rows) {
+    const bool is_upper = i + tile_rows <= columns_left;
+    if (!is_upper && (i < columns_left || i + tile_rows > end)) {
+      keep_mixed_tile(rows, size.ld, i, width, tile);
       continue;
     }
-    for (int q = 0; q < width; ++q, tile += tile_rows) {
-      for (int r = 0; r < tile_rows; ++r) {
-        padded[r] = i + r < columns_left ? upper[q * size.ld + i + r]
-                    : i + r < end        ? lower[q * size.ld + i + r]
-                                         : 0.0f;
-      }
-      keep_rows(padded, tile);
-    }
+    const float* from = (is_upper ? rows.upper : rows.lower) + i;
+    for (int q = 0; q < width; ++q) keep_rows(from + q * size.ld, tile + q * tile_rows);
   }
 }
 
@@ -226,55 +263,69 @@ inline void add_update(const Factor& factor, int child, const FrontSize& size, b
   }
 }
 
+// Writes what the matrix and `added` have of a front into the panel.
+inline void load_front(const Factor& factor, const ClothMatrix& matrix, const float* added,
+                       int front, const FrontSize& size) {
+  float* panel = factor.panel;
+  __builtin_memset(panel, 0, sizeof(float) * size.ld * size.columns);
+  const int pivot0 = factor.pivot_begin[front];
+  for (int i = 0; i < size.pivots; ++i) {
+    const float* addend = added + 6L * (pivot0 + i);
+    const float mass = matrix.diagonal[pivot0 + i];
+    float* at = panel + 3L * i * size.ld + 3L * i;
+    for (int c = 0; c < 3; ++c, at += size.ld) {
+      at[c] += mass;
+      for (int r = c; r < 3; ++r) at[r] += *addend++;
+    }
+  }
+  for (long e = factor.entry_begin[front]; e < factor.entry_begin[front + 1]; ++e) {
+    const float scalar = matrix.bending[factor.entry_slot[e]];
+    float* at = panel + 3L * factor.entry_column[e] * size.ld + size.place(factor.entry_row[e]);
+    for (int c = 0; c < 3; ++c) at[c * (size.ld + 1)] += scalar;
+    if (factor.entry_block[e] < 0) continue;
+    const float* block = matrix.membrane + 12L * factor.entry_block[e];
+    for (int c = 0; c < 3; ++c) {
+      for (int r = 0; r < 3; ++r) at[c * size.ld + r] += block[4 * c + r];
+    }
+  }
+}
+
+// Factors the columns of the panel, and writes their tiles.
+inline void factor_panel(const Factor& factor, int front, const FrontSize& size) {
+  float* panel = factor.panel;
+  long tile = factor.tile_begin[front];
+  for (int j = 0; j < size.columns; j += tile_columns) {
+    const int width = size.columns - j < tile_columns ? size.columns - j : tile_columns;
+    subtract_columns(panel, size.ld, j, width, int(size.ld));
+    factor_columns(panel + j * size.ld + j, size.ld, width, int(size.ld) - j);
+    factor.half ? keep_tiles<Half>(factor, size, j, width, tile)
+                : keep_tiles<float>(factor, size, j, width, tile);
+    tile += tile_floats(width, size.columns - j - width + 3 * size.rows);
+  }
+}
+
+// Leaves for the parent what the front subtracts from its rows, and what waits of its children.
+inline void leave_update(const Factor& factor, int front, const FrontSize& size) {
+  if (size.rows == 0) return;
+  const long ld = size.other_rows;
+  float* update = factor.updates + factor.update_begin[front];
+  negative_square(factor.panel + size.pivot_rows, size.ld, size.columns, update, ld,
+                  size.other_rows, 3 * size.rows);
+  for (int c = factor.child_begin[front]; c < factor.child_begin[front + 1]; ++c) {
+    add_update(factor, factor.children[c], size, false, update - (ld + 1) * size.pivot_rows, ld);
+  }
+}
+
 void factor(const Factor& factor, const ClothMatrix& matrix, const float* added) {
   const FlushTiny flush;
   for (int front = 0; front < factor.fronts; ++front) {
     if (!factor.due[front]) continue;
     const FrontSize size(factor, front);
-    float* panel = factor.panel;
-    const long ldu = size.other_rows;
-    float* update = factor.updates + factor.update_begin[front];
-    __builtin_memset(panel, 0, sizeof(float) * size.ld * size.columns);
-    const int pivot0 = factor.pivot_begin[front];
-    for (int i = 0; i < size.pivots; ++i) {
-      const float* addend = added + 6L * (pivot0 + i);
-      const float mass = matrix.diagonal[pivot0 + i];
-      float* at = panel + 3L * i * size.ld + 3L * i;
-      for (int c = 0; c < 3; ++c, at += size.ld) {
-        at[c] += mass;
-        for (int r = c; r < 3; ++r) at[r] += *addend++;
-      }
-    }
-    for (long e = factor.entry_begin[front]; e < factor.entry_begin[front + 1]; ++e) {
-      const float scalar = matrix.bending[factor.entry_slot[e]];
-      float* at = panel + 3L * factor.entry_column[e] * size.ld + size.place(factor.entry_row[e]);
-      for (int c = 0; c < 3; ++c) at[c * (size.ld + 1)] += scalar;
-      if (factor.entry_block[e] >= 0) {
-        const float* block = matrix.membrane + 12L * factor.entry_block[e];
-        for (int c = 0; c < 3; ++c) {
-          for (int r = 0; r < 3; ++r) at[c * size.ld + r] += block[4 * c + r];
-        }
-      }
-    }
-    const int *child = factor.children + factor.child_begin[front],
-              *last = factor.children + factor.child_begin[front + 1];
-    for (const int* c = child; c < last; ++c) add_update(factor, *c, size, true, panel, size.ld);
-    long tile = factor.tile_begin[front];
-    for (int j = 0; j < size.columns; j += tile_columns) {
-      const int width = size.columns - j < tile_columns ? size.columns - j : tile_columns;
-      subtract_columns(panel, size.ld, j, width, int(size.ld));
-      factor_columns(panel + j * size.ld + j, size.ld, width, int(size.ld) - j);
-      factor.half ? keep_tiles<Half>(factor, size, j, width, tile)
-                  : keep_tiles<float>(factor, size, j, width, tile);
-      tile += tile_floats(width, size.columns - j - width + 3 * size.rows);
-    }
-    if (size.rows > 0) {
-      negative_square(panel + size.pivot_rows, size.ld, size.columns, update, ldu, size.other_rows,
-                      3 * size.rows);
-      for (const int* c = child; c < last; ++c) {
-        add_update(factor, *c, size, false, update - (ldu + 1) * size.pivot_rows, ldu);
-      }
-    }
+    load_front(factor, matrix, added, front, size);
+    for (int c = factor.child_begin[front]; c < factor.child_begin[front + 1]; ++c)
+      add_update(factor, factor.children[c], size, true, factor.panel, size.ld);
+    factor_panel(factor, front, size);
+    leave_update(factor, front, size);
   }
 }
 

@@ -155,42 +155,51 @@ inline StretchLaw stretch_law(const double* k, bool tabulated, Lane a, Lane h, L
   return law;
 }
 
-// Makes the law's second derivatives positive semi-definite where they are not: negative
-// eigenvalues become zero [Teran et al. 2005]. (a, h, q) have the metric of strain, so this does
-// not depend on the axes.
-inline void make_definite(StretchLaw& law) {
-  constexpr int sweeps = 4;  // of Jacobi's rotations, to rounding
-  const Lane zero{}, one = zero + 1.0;
+inline bool is_definite(const StretchLaw& law) {
+  const Lane zero{};
   const Lane minor = law.aa * law.hh - law.ah * law.ah;
   const Lane whole = law.qq * minor - law.aa * law.hq * law.hq - law.hh * law.aq * law.aq +
                      2.0 * law.ah * law.aq * law.hq;
   const auto definite = (law.aa > zero) & (minor > zero) & (whole >= zero);
   bool all = true;
   for (int l = 0; l < membrane_lanes; ++l) all = all && definite[l];
-  if (all) return;
+  return all;
+}
+
+// A rotation of Jacobi that takes m_pk to zero. The columns of v become the eigenvectors.
+inline void rotate(Lane (&m)[3][3], Lane (&v)[3][3], int p, int k) {
+  const Lane zero{}, one = zero + 1.0;
+  // t^2 + 2 theta t = 1 with the smaller |t|.
+  const Lane off = 2.0 * m[p][k], gap = m[k][k] - m[p][p];
+  const Lane size = (gap < zero ? -gap : gap) + root(gap * gap + off * off) + 1e-300;
+  const Lane t = (gap < zero ? -off : off) / size, c = one / root(one + t * t), s = t * c;
+  for (int i = 0; i < 3; ++i) {
+    const Lane x = m[i][p], y = m[i][k];
+    m[i][p] = c * x - s * y, m[i][k] = s * x + c * y;
+  }
+  for (int i = 0; i < 3; ++i) {
+    const Lane x = m[p][i], y = m[k][i];
+    m[p][i] = c * x - s * y, m[k][i] = s * x + c * y;
+  }
+  for (int i = 0; i < 3; ++i) {
+    const Lane x = v[i][p], y = v[i][k];
+    v[i][p] = c * x - s * y, v[i][k] = s * x + c * y;
+  }
+}
+
+// Makes the law's second derivatives positive semi-definite where they are not: negative
+// eigenvalues become zero [Teran et al. 2005]. (a, h, q) have the metric of strain, so this does
+// not depend on the axes.
+inline void make_definite(StretchLaw& law) {
+  constexpr int sweeps = 4;  // of Jacobi's rotations, to rounding
+  if (is_definite(law)) return;
+  const Lane zero{}, one = zero + 1.0;
   Lane m[3][3] = {{law.aa, law.ah, law.aq}, {law.ah, law.hh, law.hq}, {law.aq, law.hq, law.qq}};
   Lane v[3][3] = {{one, zero, zero}, {zero, one, zero}, {zero, zero, one}};
   for (int sweep = 0; sweep < sweeps; ++sweep) {
-    for (int p = 0; p < 2; ++p) {
-      for (int k = p + 1; k < 3; ++k) {
-        // t^2 + 2 theta t = 1 with the smaller |t|.
-        const Lane off = 2.0 * m[p][k], gap = m[k][k] - m[p][p];
-        const Lane size = (gap < zero ? -gap : gap) + root(gap * gap + off * off) + 1e-300;
-        const Lane t = (gap < zero ? -off : off) / size, c = one / root(one + t * t), s = t * c;
-        for (int i = 0; i < 3; ++i) {
-          const Lane x = m[i][p], y = m[i][k];
-          m[i][p] = c * x - s * y, m[i][k] = s * x + c * y;
-        }
-        for (int i = 0; i < 3; ++i) {
-          const Lane x = m[p][i], y = m[k][i];
-          m[p][i] = c * x - s * y, m[k][i] = s * x + c * y;
-        }
-        for (int i = 0; i < 3; ++i) {
-          const Lane x = v[i][p], y = v[i][k];
-          v[i][p] = c * x - s * y, v[i][k] = s * x + c * y;
-        }
-      }
-    }
+    rotate(m, v, 0, 1);
+    rotate(m, v, 0, 2);
+    rotate(m, v, 1, 2);
   }
   // K - sum of the negative part.
   Lane* const entries[6] = {&law.aa, &law.ah, &law.aq, &law.hh, &law.hq, &law.qq};

@@ -84,59 +84,73 @@ inline void with_width(int width, const Call& call) {
   call.template operator()<3>();
 }
 
+// Copies the components of nodes from fours to threes, and back.
+inline void gather(const float* nodes, int count, float* packed) {
+  for (int i = 0; i < count; ++i) {
+    for (int c = 0; c < 3; ++c) packed[3 * i + c] = nodes[4 * i + c];
+  }
+}
+
+inline void scatter(const float* packed, int count, float* nodes) {
+  for (int i = 0; i < count; ++i) {
+    for (int c = 0; c < 3; ++c) nodes[4 * i + c] = packed[3 * i + c];
+  }
+}
+
+inline int width_at(const FrontSize& size, int column) {
+  return size.columns - column < tile_columns ? size.columns - column : tile_columns;
+}
+
+template <class Kept>
+inline void forward_front(const Factor& factor, int front, float* x) {
+  const FrontSize size(factor, front);
+  const Kept* tile = static_cast<const Kept*>(factor.tiles) + factor.tile_begin[front];
+  const int* rows = factor.rows + factor.row_begin[front];
+  const int height = size.columns + 3 * size.rows;
+  float* y = factor.local;
+  float* pivots = x + 4L * factor.pivot_begin[front];
+  gather(pivots, size.pivots, y);
+  __builtin_memset(y + size.columns, 0, sizeof(float) * (3 * size.rows + tile_rows));
+  for (int j = 0; j < size.columns; j += tile_columns) {
+    const int width = width_at(size, j), below = height - j - width;
+    with_width(width, [&]<int w>() { forward<w>(tile, y + j, below); });
+    tile += tile_floats(width, below);
+  }
+  scatter(y, size.pivots, pivots);
+  for (int i = 0; i < size.rows; ++i) {
+    float* at = x + 4L * rows[i];
+    for (int c = 0; c < 3; ++c) at[c] += y[size.columns + 3 * i + c];
+  }
+}
+
+template <class Kept>
+inline void backward_front(const Factor& factor, int front, float* x) {
+  const FrontSize size(factor, front);
+  const Kept* tile = static_cast<const Kept*>(factor.tiles) + factor.tile_begin[front + 1];
+  const int* rows = factor.rows + factor.row_begin[front];
+  const int height = size.columns + 3 * size.rows;
+  float* y = factor.local;
+  float* pivots = x + 4L * factor.pivot_begin[front];
+  gather(pivots, size.pivots, y);
+  for (int i = 0; i < size.rows; ++i) {
+    const float* at = x + 4L * rows[i];
+    for (int c = 0; c < 3; ++c) y[size.columns + 3 * i + c] = at[c];
+  }
+  __builtin_memset(y + height, 0, sizeof(float) * tile_rows);
+  for (int j = (size.columns - 1) / tile_columns * tile_columns; j >= 0; j -= tile_columns) {
+    const int width = width_at(size, j), below = height - j - width;
+    tile -= tile_floats(width, below);
+    with_width(width, [&]<int w>() { backward<w>(tile, y + j, below); });
+  }
+  scatter(y, size.pivots, pivots);
+}
+
 // In the factor's own order of nodes.
 template <class Kept>
 void solve_in_order(const Factor& factor, int nodes, const float* b, float* x) {
   if (x != b) __builtin_memcpy(x, b, 16L * nodes);
-  float* y = factor.local;
-  for (int front = 0; front < factor.fronts; ++front) {
-    const FrontSize size(factor, front);
-    const Kept* tile = static_cast<const Kept*>(factor.tiles) + factor.tile_begin[front];
-    const int* rows = factor.rows + factor.row_begin[front];
-    const int height = size.columns + 3 * size.rows;
-    float* pivots = x + 4L * factor.pivot_begin[front];
-    for (int i = 0; i < size.pivots; ++i) {
-      for (int c = 0; c < 3; ++c) y[3 * i + c] = pivots[4 * i + c];
-    }
-    __builtin_memset(y + size.columns, 0, sizeof(float) * (3 * size.rows + tile_rows));
-    for (int j = 0; j < size.columns; j += tile_columns) {
-      const int width = size.columns - j < tile_columns ? size.columns - j : tile_columns;
-      const int below = height - j - width;
-      with_width(width, [&]<int w>() { forward<w>(tile, y + j, below); });
-      tile += tile_floats(width, below);
-    }
-    for (int i = 0; i < size.pivots; ++i) {
-      for (int c = 0; c < 3; ++c) pivots[4 * i + c] = y[3 * i + c];
-    }
-    for (int i = 0; i < size.rows; ++i) {
-      float* at = x + 4L * rows[i];
-      for (int c = 0; c < 3; ++c) at[c] += y[size.columns + 3 * i + c];
-    }
-  }
-  for (int front = factor.fronts - 1; front >= 0; --front) {
-    const FrontSize size(factor, front);
-    const Kept* tile = static_cast<const Kept*>(factor.tiles) + factor.tile_begin[front + 1];
-    const int* rows = factor.rows + factor.row_begin[front];
-    const int height = size.columns + 3 * size.rows;
-    float* pivots = x + 4L * factor.pivot_begin[front];
-    for (int i = 0; i < size.pivots; ++i) {
-      for (int c = 0; c < 3; ++c) y[3 * i + c] = pivots[4 * i + c];
-    }
-    for (int i = 0; i < size.rows; ++i) {
-      const float* at = x + 4L * rows[i];
-      for (int c = 0; c < 3; ++c) y[size.columns + 3 * i + c] = at[c];
-    }
-    __builtin_memset(y + height, 0, sizeof(float) * tile_rows);
-    for (int j = (size.columns - 1) / tile_columns * tile_columns; j >= 0; j -= tile_columns) {
-      const int width = size.columns - j < tile_columns ? size.columns - j : tile_columns;
-      const int below = height - j - width;
-      tile -= tile_floats(width, below);
-      with_width(width, [&]<int w>() { backward<w>(tile, y + j, below); });
-    }
-    for (int i = 0; i < size.pivots; ++i) {
-      for (int c = 0; c < 3; ++c) pivots[4 * i + c] = y[3 * i + c];
-    }
-  }
+  for (int front = 0; front < factor.fronts; ++front) forward_front<Kept>(factor, front, x);
+  for (int front = factor.fronts - 1; front >= 0; --front) backward_front<Kept>(factor, front, x);
 }
 
 // x = K^-1 b; `x` may be `b`.
