@@ -107,7 +107,7 @@ class TestLateralBuckling:
         % lighter.
         """
         clamped = strip(0.02, 20, "alternating")
-        gamma = share * lateral_buckling.threshold(clamped, 0.0, CERTIFIED)
+        gamma = share * lateral_buckling.threshold(clamped, 0.0, CERTIFIED)[0]
         cloth, flat = lateral_buckling.loaded(
             clamped, 0.0, 0.2 * GRAVITY * LENGTH**3 / gamma, CERTIFIED
         )
