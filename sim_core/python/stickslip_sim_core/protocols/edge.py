@@ -92,8 +92,8 @@ def pull_needed(hanging: float, flat: float, radius: float, mu: float) -> float:
     tension = LINE_WEIGHT * hanging
     for angle in (np.arange(STEPS) + 0.5) / STEPS * np.pi / 2:
         # From the side of the table, where the face is upright, to the top.
-        own = LINE_WEIGHT * radius * (np.cos(angle) + mu * np.sin(angle))
-        tension += (mu * tension + own) * np.pi / 2 / STEPS
+        weight = LINE_WEIGHT * radius * (np.cos(angle) + mu * np.sin(angle))
+        tension += (mu * tension + weight) * np.pi / 2 / STEPS
     return float(tension + mu * LINE_WEIGHT * flat)
 
 

@@ -75,9 +75,7 @@ class LateralBuckling(RefinedProtocol):
         return float(master_curves.lateral_buckling(x, at["poisson"]))
 
 
-def threshold(
-    clamped: Strip, poisson: float, preset: SolverSettings
-) -> tuple[float, Cloth]:
+def threshold(clamped: Strip, poisson: float, preset: SolverSettings) -> tuple[float, Cloth]:
     """Return Gamma at which the flat strip, loaded in its plane, loses stability, and the cloth.
 
     Gamma is NaN if there is none.
