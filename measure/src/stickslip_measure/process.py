@@ -260,6 +260,10 @@ class Simulation:
         """Return the number of steps in a time, at least 1."""
         return max(1, round(seconds / self.frame))
 
+    def times(self, steps: int) -> Floats:
+        """Return the ends of so many steps, from a start at 0: (N,) [s]."""
+        return np.asarray(self.frame * np.arange(1, steps + 1), dtype=np.float64)
+
     def settle_gently(self, rate: float) -> None:
         """Let velocities decay from now on, if the simulator can, or not any more for a rate of 0.
 

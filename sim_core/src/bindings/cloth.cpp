@@ -101,6 +101,7 @@ void bind_cloth(nb::module_& m) {
           "Work of friction with each body, then surface, then sheet, and its estimated error "
           "[J].");
   m.attr("radius_least") = radius_least;
+  m.attr("compression") = compression;
   nb::class_<StepReport>(m, "StepReport", "How a step of cloth went, or several.")
       .def(nb::init<>())
       .def("add", &StepReport::add, "later"_a, "Add the report of later steps.")
@@ -217,6 +218,8 @@ void bind_cloth(nb::module_& m) {
       .def("reactions", &ClothSolver::reactions)
       .def("contacts", &ClothSolver::contacts)
       .def("sliding", &ClothSolver::sliding)
+      .def("opposites", &ClothSolver::opposites)
+      .def("opposite_forces", &ClothSolver::opposite_forces)
       .def("surface_forces", &ClothSolver::surface_forces)
       .def("pair_forces", &ClothSolver::pair_forces)
       .def("masses", &ClothSolver::masses)

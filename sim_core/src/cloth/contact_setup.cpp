@@ -96,6 +96,14 @@ std::vector<double> cells_of_vertices(const ClothMesh& mesh) {
   return out;
 }
 
+std::vector<double> areas_of_vertices(const ClothMesh& mesh) {
+  std::vector<double> out(mesh.rest.rows(), 0.0);
+  for (Eigen::Index t = 0; t < mesh.triangles.rows(); ++t) {
+    for (int c = 0; c < 3; ++c) out[mesh.triangles(t, c)] += mesh.area[t] / 3.0;
+  }
+  return out;
+}
+
 std::unique_ptr<ContactSet> contact_set_of(const ClothMesh& mesh, const Numbering& numbering,
                                            const ContactMaterials& materials,
                                            const SurfaceMeshes& surfaces) {

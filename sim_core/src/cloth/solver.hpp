@@ -35,6 +35,8 @@ struct SurfaceMeshes {
 double cell_of(const ClothMesh& mesh);
 // Side of a cell around each vertex, m: that of a square of two of its triangles.
 std::vector<double> cells_of_vertices(const ClothMesh& mesh);
+// Area of the cloth that belongs to each vertex, m^2.
+std::vector<double> areas_of_vertices(const ClothMesh& mesh);
 
 // Throws std::invalid_argument, naming the field, where the cloth would touch itself at rest.
 std::unique_ptr<ContactSet> contact_set_of(const ClothMesh& mesh, const Numbering& numbering,
@@ -87,6 +89,10 @@ class ClothSolver {
   // slides.
   std::vector<std::int32_t> contacts() const;
   std::vector<std::int32_t> sliding() const;
+  // Which body presses each vertex against that one from the other side (-1: none), and its force
+  // on the vertex, N: its share of friction is that of the normal forces.
+  std::vector<std::int32_t> opposites() const;
+  Points3 opposite_forces() const;
 
   // Force of the cloth on each vertex of the surfaces at the end of the last step, N.
   Points3 surface_forces() const;

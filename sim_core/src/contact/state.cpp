@@ -16,6 +16,10 @@ namespace {
 using Eigen::Matrix3d;
 using Eigen::Vector3d;
 
+// Cosine of the angle of two normals below which their faces are opposite: flat ones have a fillet
+// up to here.
+constexpr double opposite_cosine = -0.9;
+
 // Round faces make corners of less than 66 degrees smaller and none below 53, for cloth comes out
 // of the cusp under a box's edge; flat ones below 26 degrees.
 double fillet_radius(const Gap& a, const Gap& b) {
@@ -71,6 +75,8 @@ ContactState::ContactState(int free_nodes)
       touched(free_nodes, -1),
       sheet(free_nodes, 0),
       cell(free_nodes, 0.0),
+      thickness(free_nodes, 0.0),
+      area(free_nodes, 0.0),
       stiffness(free_nodes, 0.0),
       normal(4 * free_nodes + 64, 0.0f),
       direction(4 * free_nodes + 64, 0.0f),
@@ -122,6 +128,29 @@ BodyContact ContactState::body_contact(const std::vector<Body>& bodies, const Ve
   return on;
 }
 
+BodyContact ContactState::body_contact(const std::vector<Body>& bodies, const Vector3d& p,
+                                       int node) const {
+  BodyContact on = body_contact(bodies, p);
+  const double h = thickness[node];
+  if (on.body < 0 || on.neighbours[0] >= 0 || !(on.gap.distance < h)) return on;
+  const Vector3d foot = p - on.gap.distance * on.gap.normal;
+  for (std::size_t b = 0; b < bodies.size(); ++b) {
+    if (static_cast<int>(b) == on.body) continue;
+    const Gap gap = gap_of(bodies[b], foot);
+    const bool faces = gap.normal.dot(on.gap.normal) < opposite_cosine;
+    if (!(faces && gap.distance < std::min(h, on.across.distance))) continue;
+    on.opposite = static_cast<int>(b);
+    on.across = gap;
+  }
+  return on;
+}
+
+Vector3d ContactState::press(const BodyContact& on, int node) const {
+  if (on.opposite < 0) return Vector3d::Zero();
+  const double closed = 1.0 - on.across.distance / thickness[node];
+  return compression * area[node] * closed * on.across.normal;
+}
+
 ForceNorms ContactState::classify_contacts(const Buffer<double>& x, const Buffer<double>& start,
                                            const Buffer<double>& residual,
                                            const std::vector<Body>& at_start,
@@ -130,17 +159,15 @@ ForceNorms ContactState::classify_contacts(const Buffer<double>& x, const Buffer
   const int free_nodes = static_cast<int>(mode.size());
   for (int i = 0; i < free_nodes; ++i) {
     const Vector3d p = at_node(x, i);
-    BodyContact on = body_contact(at_end, p);
-    const Vector3d r = at_node(residual, i);
-    const auto bears = [&] {
-      return on.body >= 0 && r.dot(on.gap.normal) - stiffness[i] * on.gap.distance > 0.0;
-    };
+    BodyContact on = body_contact(at_end, p, i);
     if (surfaces) {
       const std::optional<SmoothTouch> one = surfaces->touch(i, p);
       if (one && one->gap < on.gap.distance)
         on = {{one->gap, one->normal}, static_cast<int>(at_end.size()) + one->surface};
     }
-    if (!bears()) {
+    const Vector3d r = at_node(residual, i) - press(on, i);
+    const bool bears = on.body >= 0 && r.dot(on.gap.normal) - stiffness[i] * on.gap.distance > 0.0;
+    if (!bears) {
       touched[i] = -1;
       mode[i] = contact_open;
       at_node(force, i) = -r.cast<float>();
@@ -181,7 +208,7 @@ bool ContactState::warm_start(const Buffer<double>& x, const Buffer<double>& sta
     if (history_.mode[i] == contact_open || body < 0) continue;
     BodyContact on;
     if (body < static_cast<int>(at_end.size())) {
-      on = body_contact(at_end, at_node(x, node));
+      on = body_contact(at_end, at_node(x, node), node);
       if (on.body != body) on = {gap_of(at_end[body], at_node(x, node)), body};
     } else {
       const std::optional<SmoothTouch> one = surfaces->touch(node, at_node(x, node));
@@ -205,8 +232,8 @@ bool ContactState::warm_start(const Buffer<double>& x, const Buffer<double>& sta
 
 Vector3d ContactState::slip(const BodyContact& on, const Vector3d& before, const Vector3d& p,
                             const std::vector<Body>& at_start, const std::vector<Body>& at_end) {
-  const Vector3d u =
-      on.mean([&](int b) -> Vector3d { return p - carried(at_start[b], at_end[b], before); });
+  const auto over = [&](int b) -> Vector3d { return p - carried(at_start[b], at_end[b], before); };
+  const Vector3d u = on.opposite < 0 ? on.mean(over) : 0.5 * (over(on.body) + over(on.opposite));
   return u - u.dot(on.gap.normal) * on.gap.normal;
 }
 
@@ -215,7 +242,8 @@ Contact ContactState::contact_at(int node, const BodyContact& on, const Buffer<d
                                  const std::vector<Body>& at_start,
                                  const std::vector<Body>& at_end) const {
   const Vector3d before = at_node(start, node), p = at_node(x, node), &n = on.gap.normal;
-  const Vector3d force = at_node(residual, node);
+  const Vector3d pressing = press(on, node);
+  const Vector3d force = at_node(residual, node) - pressing;
   if (on.body >= static_cast<int>(at_end.size())) {
     const Vector3d u = surfaces->slip(node, before, p);
     Contact out{on.gap.distance, n, u - u.dot(n) * n, force, surfaces->mu(node), stiffness[node]};
@@ -223,12 +251,15 @@ Contact ContactState::contact_at(int node, const BodyContact& on, const Buffer<d
                           [&](const Vector3d& near) { return surfaces->normal_near(node, near); });
     return out;
   }
-  const double mu_here = on.mean([&](int b) { return at_end[b].mu_of(sheet[node]); });
+  const auto mu_with = [&](int b) { return at_end[b].mu_of(sheet[node]); };
+  const double mu_here =
+      on.opposite < 0 ? on.mean(mu_with) : 0.5 * (mu_with(on.body) + mu_with(on.opposite));
   Contact out{on.gap.distance, n,       slip(on, before, p, at_start, at_end),
               force,           mu_here, stiffness[node]};
+  out.pressed = pressing.norm();
   // Planes are flat, and fillets hollow: there cloth does not turn at nodes.
   const Body& body = at_end[on.body];
-  if (body.shape != Body::plane && on.neighbours[0] < 0) {
+  if (body.shape != Body::plane && on.neighbours[0] < 0 && on.opposite < 0) {
     out.mu =
         corrected_mu(out, node, p, [&](const Vector3d& near) { return gap_of(body, near).normal; });
   }

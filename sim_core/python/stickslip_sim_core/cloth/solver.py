@@ -237,6 +237,22 @@ class Cloth:
         return np.asarray(self._solver.sliding(), dtype=bool)
 
     @property
+    def opposites(self) -> NDArray[np.int32]:
+        """The body that presses each vertex against the one that it touches (V,), or -1.
+
+        Between two bodies that face each other cloth is as thick as it is in self-contact.
+        """
+        return np.asarray(self._solver.opposites(), dtype=np.int32)
+
+    @property
+    def opposite_forces(self) -> Floats:
+        """Forces of `opposites` on the vertices (V, 3) [N], which are part of `reactions`.
+
+        The friction of both bodies together is known. It is shared as their normal forces are.
+        """
+        return np.asarray(self._solver.opposite_forces())
+
+    @property
     def pair_forces(self) -> PairForces:
         """Forces of pairs of closest points at the end of the last step.
 

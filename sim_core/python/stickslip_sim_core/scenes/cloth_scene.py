@@ -302,11 +302,19 @@ class _Forces:
             # The reaction of a held vertex is the force of its holder, and no contact.
             held = np.isin(np.arange(vertices), cloth.held)
             touching = np.flatnonzero((contacts >= 0) & ~held)
+            opposites = cloth.opposites
+            across = cloth.opposite_forces
+            pressed = np.flatnonzero(opposites >= 0)
             # Several vertices add to the same entry, which `force[...] +=` would count once.
             np.add.at(
                 force,
                 (self._owner[touching], self._others[contacts[touching]]),
-                reactions[touching],
+                reactions[touching] - across[touching],
+            )
+            np.add.at(
+                force,
+                (self._owner[pressed], self._others[opposites[pressed]]),
+                across[pressed],
             )
             state[touching] = np.where(cloth.sliding[touching], 2, 1)
             owner = self._owner[pairs.vertices]
