@@ -12,8 +12,9 @@ from stickslip_schemas.base import Document
 from stickslip_schemas.kinds import KINDS
 from stickslip_schemas.kinds.cloth.spec import ClipSpec
 from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
+from stickslip_schemas.spec.fabrics import FabricDistribution, FabricNumbers, FabricRanges
 from stickslip_schemas.spec.jobs import JobSpec
-from stickslip_schemas.spec.names import Calibration, FabricNumbers, FloorNumbers, LampNumbers
+from stickslip_schemas.spec.names import Calibration, FloorNumbers, LampNumbers
 
 HEAD = """# Every key of a spec
 
@@ -38,7 +39,9 @@ An axis, under `axes`, has one of these forms:
 
 A random or Sobol axis may have a `seed`, 0 by default.
 
-An axis of names, such as `material`, takes one name or a list. A job has at most 1,000,000 samples.
+An axis of names, such as `material`, takes one name or a list. An axis of fabrics may draw them:
+`{distribution: measured-618, num: 100}`, see [drawn fabrics](#drawn-fabrics). A job has
+at most 1,000,000 samples.
 """
 
 AXIS_HEAD = ("| axis | values | meaning |", "|---|---|---|")
@@ -87,7 +90,18 @@ def reference() -> str:
         }
         lines += [f"## Custom {what}s\n", f"Entries of `{key}`. {meaning}\n"]
         lines += _table(KEY_HEAD, rows)
-    return "\n".join(lines)
+    return "\n".join(lines + _drawn_fabrics())
+
+
+def _drawn_fabrics() -> list[str]:
+    """Return the section of axes that draw fabrics."""
+    lines = ["## Drawn fabrics\n"]
+    for model in (FabricDistribution, FabricRanges):
+        schema = model.model_json_schema()
+        fields = schema["properties"].items()
+        rows = {name: _field_row(name, field, schema) for name, field in fields}
+        lines += [f"{' '.join((model.__doc__ or '').split())}\n", *_table(KEY_HEAD, rows)]
+    return lines
 
 
 def _shared(tables: Iterable[Rows]) -> Rows:

@@ -84,6 +84,8 @@ class Axis:
     range: str = ""
     default: str = ""
     """The value without an axis; empty if there is none."""
+    can_draw: bool = False
+    """Whether fabrics may be drawn instead of chosen."""
 
 
 @dataclass(frozen=True)
@@ -221,6 +223,7 @@ def _axes(spec_type: type[JobSpec], schema: Schema, scene: Scene | None) -> list
                     choices=choices,
                     range=parameter.range if is_number else "",
                     default=f"{default:g}" if is_number else str(default),
+                    can_draw=not is_number and not parameter.values,
                 )
             )
     of_axes = _resolved(schema["properties"]["axes"], schema)
@@ -234,7 +237,8 @@ def _axes(spec_type: type[JobSpec], schema: Schema, scene: Scene | None) -> list
 
 def _axis(name: str, schema: Schema, whole: Schema, is_required: bool) -> Axis:
     """Return an axis of the schema, whose first alternative is one value."""
-    value = _resolved(schema["anyOf"][0], whole)
+    forms = [_resolved(part, whole) for part in schema["anyOf"]]
+    value = forms[0]
     # Names are one of the built-in ones, or the name of a custom one.
     parts = [_resolved(part, whole) for part in value.get("anyOf", [value])]
     choices = tuple(choice for part in parts for choice in _choices(part))
@@ -247,6 +251,7 @@ def _axis(name: str, schema: Schema, whole: Schema, is_required: bool) -> Axis:
         is_number=is_number,
         choices=choices,
         range=" to ".join(f"{end:g}" for end in ends),
+        can_draw=any("distribution" in part.get("properties", ()) for part in forms),
     )
 
 
@@ -302,6 +307,8 @@ def _scalar(text: str) -> int | float | str:
 def _axis_value(axis: Axis, sent: Sent) -> object:
     """Return the value of an axis as a spec writes it; None if its fields are empty."""
     name = f"axes.{axis.name}"
+    if axis.can_draw and (num := _text(sent, f"{name}.num")):
+        return {"distribution": "measured-618", "num": _scalar(num)}
     if axis.choices:
         chosen = [value for value in sent.get(f"{name}.values", ()) if value]
         return _short(chosen)

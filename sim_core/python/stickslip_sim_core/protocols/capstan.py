@@ -78,8 +78,11 @@ class Capstan(ClothProtocol):
 class Strip:
     """A strip without weight over a cylinder along y, two cells wide.
 
-    A pull of `LIGHT` hangs on its free end.
+    A pull of `light` hangs on its free end.
     """
+
+    light: ClassVar[float] = LIGHT
+    """Pull at the free end [N/m]."""
 
     apart: ClassVar[float] = 0.0
     """Distance from the cylinder at the start, in thicknesses."""
@@ -102,12 +105,12 @@ class Strip:
         self.bodies: list[Body] = []
         self.below = np.empty((0, 3))
         """Held vertices of other cloth, after those of the strip."""
-        material = isotropic(DENSITY, STRETCHING, 2.0 * RADIUS**2 * bending * LIGHT)
-        self.cloth = self.over(mu, mesh, material, FORCE_SHARE * LIGHT * self.cell)
+        material = isotropic(DENSITY, STRETCHING, 2.0 * RADIUS**2 * bending * self.light)
+        self.cloth = self.over(mu, mesh, material, FORCE_SHARE * self.light * self.cell)
         self.breadth = WIDTH * self.cell
         # Gravity on the vertices of the free end stands for the pull. The rest has no weight.
         self.cloth.gravity[:] = 0.0
-        self.cloth.gravity[light, 2] = -LIGHT * self.breadth / self.cloth.masses[light].sum()
+        self.cloth.gravity[light, 2] = -self.light * self.breadth / self.cloth.masses[light].sum()
         # The strip starts wrapped around the cylinder, with both free ends tangential to it.
         clearance = RADIUS + self.apart * THICKNESS
         angle = np.clip(along / RADIUS, 0.0, WRAP)
