@@ -24,6 +24,7 @@ FOLDERS = (
     "sim_core/python",
     "sim_core/src",
     "training/src",
+    "measure/src",
     "workers/src",
     "workers/blender/src",
     "workers/blender/raster",

@@ -67,7 +67,7 @@ class PresetName(StrEnum):
     thesis_low_big_dt = "thesis-low-big-dt"
 
 
-CONTACT_PROTOCOLS = ("capstan", "heavy-fold", "stacked-incline", "pull-out")
+CONTACT_PROTOCOLS = ("capstan", "edge", "heavy-fold", "stacked-incline", "pull-out")
 """Protocols that a certificate also needs if cloth touches itself or other cloth."""
 
 

@@ -36,7 +36,7 @@ AXIS_FORMS = {
 }
 """Forms of an axis of numbers, with the words of the page."""
 
-_ENDS = {"linspace": ("start", "stop"), "random": ("low", "high"), "sobol": ("low", "high")}
+RANGE_ENDS = {"linspace": ("start", "stop"), "random": ("low", "high"), "sobol": ("low", "high")}
 """Keys of the two ends of a range, by the form of the axis."""
 
 _SEPARATORS = re.compile(r"[\s,;]+")
@@ -100,6 +100,21 @@ class SubmitForm:
     settings: tuple[Setting, ...]
     others: tuple[str, ...] = ()
     """Keys that only YAML can give."""
+
+    @property
+    def first_axes(self) -> tuple[Axis, ...]:
+        """Those that a grid needs, and the parameters of a scene."""
+        return tuple(axis for axis in self.axes if self._comes_first(axis))
+
+    @property
+    def more_axes(self) -> tuple[Axis, ...]:
+        """All others."""
+        return tuple(axis for axis in self.axes if not self._comes_first(axis))
+
+    def _comes_first(self, axis: Axis) -> bool:
+        # Of a scene, what has a default is a parameter; looks have none.
+        is_parameter = self.scene is not None and bool(axis.default)
+        return axis.is_required or is_parameter
 
     @property
     def first_settings(self) -> tuple[Setting, ...]:
@@ -316,12 +331,12 @@ def _axis_value(axis: Axis, sent: Sent) -> object:
     if form == "values":
         words = [word for word in _SEPARATORS.split(_text(sent, f"{name}.values")) if word]
         return _short([_scalar(word) if axis.is_number else word for word in words])
-    if form not in _ENDS:
+    if form not in RANGE_ENDS:
         raise FormError(name, f"must be one of {', '.join(AXIS_FORMS)}, and is {form[:50]!r}")
     parts = {key: _text(sent, f"{name}.{key}") for key in ("from", "to", "num")}
     if not any(parts.values()):
         return None
-    first, last = _ENDS[form]
+    first, last = RANGE_ENDS[form]
     keys = {first: parts["from"], last: parts["to"], "num": parts["num"]}
     # An empty part is left out, and the model says that it is required.
     return {"type": form, **{key: _scalar(text) for key, text in keys.items() if text}}

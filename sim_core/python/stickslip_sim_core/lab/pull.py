@@ -40,7 +40,7 @@ class CapstanPull:
 class _FabricStrip(Strip):
     """A strip of a fabric, which a light pull keeps from stretching much."""
 
-    light: ClassVar[float] = 0.2
+    light_pull: ClassVar[float] = 0.2
 
     def __init__(self, fabric: Fabric, mu: float) -> None:
         self.fabric = fabric
@@ -61,4 +61,4 @@ def pull(fabric: Fabric, mu: float) -> CapstanPull:
     check_range("mu", mu, 0.01, 1.5)
     strip = _FabricStrip(fabric, mu)
     heavy, wrap = strip.draw()
-    return CapstanPull(fabric.name, mu, strip.light, float(heavy.mean()), wrap)
+    return CapstanPull(fabric.name, mu, strip.light_pull, float(heavy.mean()), wrap)

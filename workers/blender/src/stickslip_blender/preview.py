@@ -62,7 +62,8 @@ def draw(scene: Mapping[str, Any], record: Mapping[str, Array], out: Path) -> li
     stage = Stage(scene["scene"], sheet, scene["segments"], record, picture)
     geometry = Geometry(record[f"{sheet}.triangles"], record[f"{sheet}.rest"], stage)
     given = [Camera.model_validate(camera) for camera in scene["cameras"]]
-    cameras = [scaled(camera, SIDE / camera.width) for camera in given] or [
+    # Pictures stand side by side in the clip, so all of them have one height.
+    cameras = [scaled(camera, SIDE / camera.height) for camera in given] or [
         stage.camera(name, geometry, (SIDE, SIDE)) for name in FRAMING
     ]
     colors = _colors(geometry)
