@@ -344,13 +344,13 @@ def _watch_waits(queue: Queue, job: str, result: dict[str, Any]) -> Iterator[Non
     }
     waits: dict[str, dict[str, float]] = {}
     for verb, call in verbs.items():
-        with Others(queue) as others:
+        with Competitor(queue) as competitor:
             time.sleep(SETTLING_SECONDS)
             begin = time.perf_counter()
             call()
             wall = 1e3 * (time.perf_counter() - begin)
             time.sleep(SETTLING_SECONDS)
-        waits[verb] = {"call": round(wall, 1), **summarise(others.waits)}
+        waits[verb] = {"call": round(wall, 1), **summarise(competitor.waits)}
         yield
     result["waits_ms"] = waits
 
@@ -359,7 +359,7 @@ def _cancel(context: Context, job: str) -> None:
     control.cancel_job(context, job)
 
 
-class Others:
+class Competitor:
     """A worker in a thread, which leases tasks and gives them back."""
 
     def __init__(self, queue: Queue) -> None:
@@ -368,7 +368,7 @@ class Others:
         self._ends = threading.Event()
         self._thread = threading.Thread(target=self._run)
 
-    def __enter__(self) -> "Others":
+    def __enter__(self) -> "Competitor":
         self._thread.start()
         return self
 
