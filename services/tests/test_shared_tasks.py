@@ -67,9 +67,9 @@ def test_a_shared_shard_outlives_the_job_that_planned_it_first(
 
     # The first shard of the large dataset, which the small one shared, is damaged.
     damage_first_shard(context, worker)
-    worker.ran.clear()
+    worker.finished_ids.clear()
     finish(context, worker, clock, submit(context, gamma=(1.0, 2.0, 3.0)))
-    assert [name.partition("-")[0] for name in worker.ran] == ["pack", "publish"]
+    assert [name.partition("-")[0] for name in worker.finished_ids] == ["pack", "publish"]
 
 
 def test_a_damaged_rejection_of_a_render_is_restored_and_nothing_is_rendered(
@@ -87,10 +87,10 @@ def test_a_damaged_rejection_of_a_render_is_restored_and_nothing_is_rendered(
     sweep(context)
     assert show_job(context, job).reason is Reason.damaged_row
 
-    worker.ran.clear()
+    worker.finished_ids.clear()
     ended = JobState.succeeded_with_rejects
     again = finish(context, worker, clock, submit(context, phi1=(1.0,)), ended)
-    assert {name.partition("-")[0] for name in worker.ran} == {"pack", "publish"}
+    assert {name.partition("-")[0] for name in worker.finished_ids} == {"pack", "publish"}
     assert again.progress.stages[Stage.render].counts == {
         TaskState.succeeded: 1,
         TaskState.rejected: 1,
@@ -125,8 +125,8 @@ def test_a_job_that_found_its_results_costs_nothing(
     """Even if one of them was damaged, and was made again for it."""
     first = finish(context, worker, clock, submit(context))
     damage_first_shard(context, worker)
-    worker.ran.clear()
+    worker.finished_ids.clear()
     second = finish(context, worker, clock, submit(context))
-    assert [name.partition("-")[0] for name in worker.ran] == ["pack", "publish"]
+    assert [name.partition("-")[0] for name in worker.finished_ids] == ["pack", "publish"]
     assert min(stage.cpu_seconds for stage in first.progress.stages.values()) > 0.0
     assert {stage.cpu_seconds for stage in second.progress.stages.values()} == {0.0}
