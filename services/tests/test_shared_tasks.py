@@ -122,7 +122,7 @@ def test_a_task_that_nobody_needed_any_more_gets_all_its_tries(
 def test_a_job_that_found_its_results_costs_nothing(
     context: Context, worker: PretendWorker, clock: ManualClock
 ) -> None:
-    """Even if one of them was damaged, and was made again for it."""
+    """Even if one of them was damaged, and its task ran again."""
     first = finish(context, worker, clock, submit(context))
     damage_first_shard(context, worker)
     worker.finished_ids.clear()
