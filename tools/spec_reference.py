@@ -82,13 +82,13 @@ def reference() -> str:
         known = {**every, **(every_cloth if name in cloth else {})}
         lines += _table(AXIS_HEAD, _without(axes[name], cloth_axes if name in cloth else {}))
         lines += _table(KEY_HEAD, _without(keys[name], known))
-    for key, what, model in CUSTOM:
+    for key, entry_name, model in CUSTOM:
         meaning = " ".join((model.__doc__ or "").split("\n\n", 1)[-1].split())
         schema = model.model_json_schema()
         rows = {
             name: _field_row(name, field, schema) for name, field in schema["properties"].items()
         }
-        lines += [f"## Custom {what}s\n", f"Entries of `{key}`. {meaning}\n"]
+        lines += [f"## Custom {entry_name}s\n", f"Entries of `{key}`. {meaning}\n"]
         lines += _table(KEY_HEAD, rows)
     return "\n".join(lines + _drawn_fabrics())
 
@@ -106,9 +106,11 @@ def _drawn_fabrics() -> list[str]:
 
 def _shared(tables: Iterable[Rows]) -> Rows:
     """Return the rows that all tables have, in the order of the first table."""
-    first, *others = tables
+    first, *further_tables = tables
     return {
-        name: row for name, row in first.items() if all(table.get(name) == row for table in others)
+        name: row
+        for name, row in first.items()
+        if all(table.get(name) == row for table in further_tables)
     }
 
 

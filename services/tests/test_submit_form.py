@@ -74,7 +74,7 @@ def test_fabrics_are_drawn_where_a_number_of_them_is_given() -> None:
 def test_every_key_of_every_kind_has_a_field_or_is_named(kind: str) -> None:
     form = form_of(kind, None)
     schema = KINDS[kind].model_json_schema()
-    known = {setting.name for setting in form.settings} | set(form.others)
+    known = {setting.name for setting in form.settings} | set(form.yaml_keys)
     assert known | {"kind", "name", "scene", "set", "axes"} >= set(schema["properties"])
     axes = schema["$defs"][schema["properties"]["axes"]["$ref"].rpartition("/")[2]]
     assert {axis.name for axis in form.axes} >= set(axes["properties"])

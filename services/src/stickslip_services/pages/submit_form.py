@@ -98,7 +98,7 @@ class SubmitForm:
     scenes: tuple[str, ...]
     axes: tuple[Axis, ...]
     settings: tuple[Setting, ...]
-    others: tuple[str, ...] = ()
+    yaml_keys: tuple[str, ...] = ()
     """Keys that only YAML can give."""
 
     @property
@@ -140,7 +140,7 @@ def form_of(kind: str, scene: str | None) -> SubmitForm:
     schema = spec_type.model_json_schema()
     scenes = scene_names() if "scene" in schema["properties"] else ()
     chosen = load_scene(scene or scenes[0]) if scenes else None
-    settings, others = _settings(schema)
+    settings, yaml_keys = _settings(schema)
     return SubmitForm(
         kind=kind,
         title=kinds()[kind] if chosen is None else chosen.description,
@@ -148,7 +148,7 @@ def form_of(kind: str, scene: str | None) -> SubmitForm:
         scenes=scenes,
         axes=tuple(_axes(spec_type, schema, chosen)),
         settings=settings,
-        others=others,
+        yaml_keys=yaml_keys,
     )
 
 
@@ -176,18 +176,18 @@ def _resolved(schema: Schema, whole: Schema) -> Schema:
 def _settings(schema: Schema) -> tuple[tuple[Setting, ...], tuple[str, ...]]:
     """Return the keys that have a field, and those that have none."""
     settings: dict[str, Setting] = {}
-    others: list[str] = []
+    yaml_keys: list[str] = []
     for name, raw in schema["properties"].items():
         if name in HANDLED:
             continue
         setting = _setting(name, _resolved(raw, schema), schema)
         if setting is None:
-            others.append(name)
+            yaml_keys.append(name)
         else:
             settings[name] = setting
     first = [settings[name] for name in FIRST_SETTINGS if name in settings]
     rest = [setting for name, setting in settings.items() if name not in FIRST_SETTINGS]
-    return (*first, *rest), tuple(others)
+    return (*first, *rest), tuple(yaml_keys)
 
 
 _SCALARS = {"boolean": "flag", "integer": "number", "number": "number", "string": "text"}
