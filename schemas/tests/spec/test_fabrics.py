@@ -96,7 +96,7 @@ def test_one_rigidity_in_each_unit_is_one_card() -> None:
     for unit, scale in fabrics.UNITS.items():
         bending = {"warp": 1e-5 / scale, "weft": 2e-5 / scale, "diagonal": 1.5e-5 / scale}
         cards.append(FabricNumbers.model_validate(CARD | {"bending": bending | {"unit": unit}}))
-    # The twist is what is left of the diagonal after a quarter of the other two.
+    # A quarter of the other two comes off the diagonal: the rest is the twist.
     assert {card.bending for card in cards} == {(1e-5, 2e-5, 7.5e-6)}
     assert {card.identity for card in cards} == {cards[0].identity}
 

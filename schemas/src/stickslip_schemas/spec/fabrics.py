@@ -329,7 +329,7 @@ def _moved(item: ErrorDetails, location: Location) -> InitErrorDetails:
 
 
 class MeasuredFabric(NamedTuple):
-    """What is known of a built-in fabric: it is one specimen, and its name says no more."""
+    """Facts of a built-in fabric: it is one specimen, and its name says no more."""
 
     density: float
     """Mass per area [kg/m^2]."""
