@@ -118,7 +118,7 @@ def paths(app: FastAPI, worker: PretendWorker) -> list[str]:
         "/workers",
         "/docs",
         *shown,
-        f"{jobs[0]}/tasks/{worker.ran[0]}",
+        f"{jobs[0]}/tasks/{worker.finished_ids[0]}",
         "/submit",
         "/submit?kind=cloth_drag",
         "/scenes",

@@ -54,11 +54,27 @@ def test_a_form_gives_the_spec_that_it_shows() -> None:
     assert job_spec_adapter.validate_python(document).sample_count == 10
 
 
+def test_fabrics_are_drawn_where_a_number_of_them_is_given() -> None:
+    fields = [
+        ("axes.material.values", "gray-interlock"),
+        ("axes.material.num", "5"),
+        ("axes.mu.values", "0.3"),
+        ("axes.texture.values", "dots"),
+        ("axes.viewpoint.values", "left"),
+        ("store_positions", "yes"),
+    ]
+    document = document_of(form_of("cloth_drag", None), grouped(fields))
+    assert document["axes"]["material"] == {"distribution": "measured-618", "num": 5}
+    assert job_spec_adapter.validate_python(document).sample_count == 5
+    belt = document_of(form_of("cloth_scene", "belt"), grouped([*BELT, ("axes.fabric.num", "3")]))
+    assert job_spec_adapter.validate_python(belt).sample_count == 30
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_key_of_every_kind_has_a_field_or_is_named(kind: str) -> None:
     form = form_of(kind, None)
     schema = KINDS[kind].model_json_schema()
-    known = {setting.name for setting in form.settings} | set(form.others)
+    known = {setting.name for setting in form.settings} | set(form.yaml_keys)
     assert known | {"kind", "name", "scene", "set", "axes"} >= set(schema["properties"])
     axes = schema["$defs"][schema["properties"]["axes"]["$ref"].rpartition("/")[2]]
     assert {axis.name for axis in form.axes} >= set(axes["properties"])

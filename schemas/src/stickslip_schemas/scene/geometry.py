@@ -104,51 +104,51 @@ def _morton_codes(points: Floats) -> Integers:
     return codes
 
 
-def overlapping_boxes(one: BoxTree, other: BoxTree) -> Iterator[tuple[Integers, Integers]]:
+def overlapping_boxes(first: BoxTree, second: BoxTree) -> Iterator[tuple[Integers, Integers]]:
     """Yield the pairs of boxes that overlap, as numbers of boxes, in batches."""
     start = (np.zeros(1, np.int64), np.zeros(1, np.int64), 0, 0)
     waiting = [start]
     while waiting:
-        i, j, level_one, level_other = waiting.pop()
-        low_one, high_one = one.levels[level_one]
-        low_other, high_other = other.levels[level_other]
-        overlaps = (low_one[i] <= high_other[j]) & (low_other[j] <= high_one[i])
-        kept = overlaps.all(axis=1)
-        i = i[kept]
-        j = j[kept]
+        i, j, level_first, level_second = waiting.pop()
+        low_first, high_first = first.levels[level_first]
+        low_second, high_second = second.levels[level_second]
+        overlaps = (low_first[i] <= high_second[j]) & (low_second[j] <= high_first[i])
+        overlap_everywhere = overlaps.all(axis=1)
+        i = i[overlap_everywhere]
+        j = j[overlap_everywhere]
         if not len(i):
             continue
-        if level_one == one.depth and level_other == other.depth:
-            yield one.order[i], other.order[j]
+        if level_first == first.depth and level_second == second.depth:
+            yield first.order[i], second.order[j]
             continue
         # Both trees are descended by one level, as long as they have another.
-        if level_one < one.depth:
+        if level_first < first.depth:
             i, j = np.repeat(2 * i, 2) + np.tile([0, 1], len(i)), np.repeat(j, 2)
-            level_one += 1
-        if level_other < other.depth:
+            level_first += 1
+        if level_second < second.depth:
             j, i = np.repeat(2 * j, 2) + np.tile([0, 1], len(j)), np.repeat(i, 2)
-            level_other += 1
+            level_second += 1
         for begin in range(0, len(i), CANDIDATES_AT_ONCE):
             end = begin + CANDIDATES_AT_ONCE
-            waiting.append((i[begin:end], j[begin:end], level_one, level_other))
+            waiting.append((i[begin:end], j[begin:end], level_first, level_second))
 
 
 # ---- Crossings
 
 
 def find_crossing(
-    one: TriangleMesh, other: TriangleMesh, *, batches: int | None = None
+    first: TriangleMesh, second: TriangleMesh, *, batches: int | None = None
 ) -> Crossing | None:
     """Return two triangles of two meshes that cross; None if none do.
 
     `batches` ends the search after so many batches of candidates, where another fault is known.
     """
-    corners_one = one.corners
-    corners_other = other.corners
-    for i, j in islice(overlapping_boxes(one.tree, other.tree), batches):
-        crosses = _cross(corners_one[i], corners_other[j])
+    corners_first = first.corners
+    corners_second = second.corners
+    for i, j in islice(overlapping_boxes(first.tree, second.tree), batches):
+        crosses = _cross(corners_first[i], corners_second[j])
         if crosses.any():
-            return _crossing(i, j, crosses, corners_one)
+            return _crossing(i, j, crosses, corners_first)
     return None
 
 
@@ -174,10 +174,10 @@ def _crossing(
     return Crossing(int(i[number]), int(j[number]), (x, y, z))
 
 
-def _cross(one: Floats, other: Floats) -> npt.NDArray[np.bool_]:
+def _cross(first: Floats, second: Floats) -> npt.NDArray[np.bool_]:
     """Return whether an edge of either triangle pierces the other: (N,), of corners (N, 3, 3)."""
-    pierces = np.zeros(len(one), dtype=bool)
-    for triangles, cutters in ((one, other), (other, one)):
+    pierces = np.zeros(len(first), dtype=bool)
+    for triangles, cutters in ((first, second), (second, first)):
         # Most neighbours lie on one side of each other's plane, and are done with here.
         sides = _sides(cutters, triangles)
         straddling = np.flatnonzero((sides.min(axis=1) < 0.0) & (sides.max(axis=1) > 0.0))

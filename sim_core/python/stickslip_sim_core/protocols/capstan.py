@@ -81,8 +81,11 @@ class Capstan(ClothProtocol):
 class Strip:
     """A strip without weight over a cylinder along y, two cells wide.
 
-    A pull of `LIGHT` hangs on its free end.
+    A pull of `light_pull` hangs on its free end.
     """
+
+    light_pull: ClassVar[float] = LIGHT
+    """Pull at the free end [N/m]."""
 
     apart: ClassVar[float] = 0.0
     """Distance from the cylinder at the start, in thicknesses."""
@@ -105,7 +108,7 @@ class Strip:
         self.bodies: list[Body] = []
         self.below = np.empty((0, 3))
         """Held vertices of other cloth, after those of the strip."""
-        material = isotropic(DENSITY, STRETCHING, 2.0 * RADIUS**2 * bending * LIGHT)
+        material = isotropic(DENSITY, STRETCHING, 2.0 * RADIUS**2 * bending * self.light_pull)
         self.breadth = WIDTH * self.cell
         # The strip starts wrapped around the cylinder, with both free ends tangential to it.
         clearance = RADIUS + self.apart * THICKNESS
@@ -119,7 +122,7 @@ class Strip:
             ]
         )
         self.ahead = np.array([np.sin(WRAP), 0.0, np.cos(WRAP)])
-        force_scale = FORCE_SHARE * LIGHT * self.cell
+        force_scale = FORCE_SHARE * self.light_pull * self.cell
         settled = self._settled(self._pulled(self.over(0.0, mesh, material, force_scale)))
         self.cloth = self._pulled(self.over(mu, mesh, material, force_scale))
         self.cloth.set_state(settled)
@@ -129,7 +132,9 @@ class Strip:
     def _pulled(self, cloth: Cloth) -> Cloth:
         """Let gravity on the vertices of the free end stand for the light pull."""
         cloth.gravity[:] = 0.0
-        cloth.gravity[self.light, 2] = -LIGHT * self.breadth / cloth.masses[self.light].sum()
+        cloth.gravity[self.light, 2] = (
+            -self.light_pull * self.breadth / cloth.masses[self.light].sum()
+        )
         return cloth
 
     def _settled(self, smooth: Cloth) -> Floats:
