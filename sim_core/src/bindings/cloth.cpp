@@ -194,7 +194,7 @@ void bind_cloth(nb::module_& m) {
       .def(
           "advance",
           [](ClothSolver& self, double time, double event, const ConditionsCallback& conditions,
-             const TableCallback& table) {
+             const TableCallback& table, bool may_fail) {
             DriveNow now;
             nb::gil_scoped_release release;
             const auto conditions_at = [&](double at) -> BoundaryConditions {
@@ -208,10 +208,11 @@ void bind_cloth(nb::module_& m) {
               auto [points, poses] = table(times);
               return {points, poses};
             };
-            const StepReport report = self.advance(time, event, {conditions_at, table_at});
+            const StepReport report =
+                self.advance(time, event, {conditions_at, table_at}, may_fail);
             return std::make_tuple(time, report);
           },
-          "time"_a, "event"_a, "conditions"_a, "table"_a)
+          "time"_a, "event"_a, "conditions"_a, "table"_a, "may_fail"_a)
       .def("momentum_rate", &ClothSolver::momentum_rate)
       .def("positions", &ClothSolver::positions)
       .def("velocities", &ClothSolver::velocities)

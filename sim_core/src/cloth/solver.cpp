@@ -136,8 +136,10 @@ StepReport ClothSolver::step(double dt, const Points3& gravity, const Points3& h
   return impl_->stepper.step(dt, {gravity, held, surfaces, bodies, damping});
 }
 
-StepReport ClothSolver::advance(double& time, double event, const PrescribedMotion& motion) {
+StepReport ClothSolver::advance(double& time, double event, const PrescribedMotion& motion,
+                                bool may_fail) {
   if (!impl_->stepper.started()) begin(motion.conditions(time).bodies);
+  impl_->stepper.may_fail = may_fail;
   return impl_->controller.advance(time, event, motion);
 }
 
