@@ -86,54 +86,54 @@ def _morton_codes(points: Floats) -> Integers:
 
 
 def overlapping_boxes(
-    one: BoxTree, other: BoxTree, workload: Workload, *, reach: float = 0.0
+    first: BoxTree, second: BoxTree, workload: Workload, *, reach: float = 0.0
 ) -> Iterator[tuple[Integers, Integers]]:
     """Yield the pairs of boxes that overlap, as numbers of boxes, in batches.
 
-    Boxes that are nearer to each other than `reach` [m] along each axis count as overlapping. If a
+    Boxes that are nearer to each second than `reach` [m] along each axis count as overlapping. If a
     tree is compared with itself, each pair comes once.
 
     Raises:
         TooManyPairsError: The workload ends.
     """
-    is_same = one is other
+    is_same = first is second
     start = (np.zeros(1, np.int64), np.zeros(1, np.int64), 0, 0)
     waiting = [start]
     while waiting:
-        i, j, level_one, level_other = waiting.pop()
+        i, j, level_first, level_second = waiting.pop()
         workload.add(len(i))
-        i, j = _overlapping(i, j, one.levels[level_one], other.levels[level_other], reach)
+        i, j = _overlapping(i, j, first.levels[level_first], second.levels[level_second], reach)
         if not len(i):
             continue
-        if level_one == one.depth and level_other == other.depth:
-            yield one.order[i], other.order[j]
+        if level_first == first.depth and level_second == second.depth:
+            yield first.order[i], second.order[j]
             continue
         # Both trees are descended by one level, as long as they have another.
-        if level_one < one.depth:
+        if level_first < first.depth:
             i, j = np.repeat(2 * i, 2) + np.tile([0, 1], len(i)), np.repeat(j, 2)
-            level_one += 1
-        if level_other < other.depth:
+            level_first += 1
+        if level_second < second.depth:
             j, i = np.repeat(2 * j, 2) + np.tile([0, 1], len(j)), np.repeat(i, 2)
-            level_other += 1
+            level_second += 1
         if is_same:
             is_first = i <= j
             i, j = i[is_first], j[is_first]
         for begin in range(0, len(i), CANDIDATES_AT_ONCE):
             end = begin + CANDIDATES_AT_ONCE
-            waiting.append((i[begin:end], j[begin:end], level_one, level_other))
+            waiting.append((i[begin:end], j[begin:end], level_first, level_second))
 
 
 def _overlapping(
     i: Integers,
     j: Integers,
-    one: tuple[Floats, Floats],
-    other: tuple[Floats, Floats],
+    first: tuple[Floats, Floats],
+    second: tuple[Floats, Floats],
     reach: float,
 ) -> tuple[Integers, Integers]:
     """Return the pairs of nodes i and j whose boxes overlap, of a level of each tree."""
     # Each coordinate leaves fewer pairs to the next one.
-    for low_one, high_one, low_other, high_other in zip(*one, *other, strict=True):
-        overlaps = low_one[i] <= high_other[j] + reach
-        overlaps &= low_other[j] <= high_one[i] + reach
+    for low_first, high_first, low_second, high_second in zip(*first, *second, strict=True):
+        overlaps = low_first[i] <= high_second[j] + reach
+        overlaps &= low_second[j] <= high_first[i] + reach
         i, j = i[overlaps], j[overlaps]
     return i, j

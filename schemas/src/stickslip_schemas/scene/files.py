@@ -23,7 +23,7 @@ from stickslip_schemas.scene.gate import MAX_TRIANGLES, check_file, is_path_tabl
 from stickslip_schemas.scene.mesh_files import FARTHEST, Polygons, has_order, read_polygons
 from stickslip_schemas.scene.parameters import Location, value_at, with_values
 from stickslip_schemas.scene.parts import LARGEST, SMALLEST, MeshBody, unit_hint
-from stickslip_schemas.scene.polygons import Floats, Indices, triangulate, weld
+from stickslip_schemas.scene.polygons import Floats, Indices, repeated_numbers, triangulate, weld
 from stickslip_schemas.scene.reading import read_once
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl")
@@ -334,30 +334,23 @@ def _check_edges(triangles: Indices, vertices: int) -> None:
             f"{vertices} and {len(triangles)}"
         )
     # One number for each row: sorting rows takes ten times as long.
-    a, b, c = triangles.T
-    least, greatest = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
-    numbers = (least * vertices + (a + b + c - least - greatest)) * vertices + greatest
-    repeated = _repeated(numbers)
+    a, b, c = np.sort(triangles, axis=1).T
+    numbers = (a * vertices + b) * vertices + c
+    repeated = repeated_numbers(numbers)
     if len(repeated):
-        first = int(np.argmax(numbers == repeated[0]))
         raise UnfitFileError(
             f"each triangle must be there once, and {len(repeated)} repeat another one, such as "
-            f"triangle {first}: delete them (in Blender: merge vertices by distance)"
+            f"triangle {int(np.argmax(numbers == repeated[0]))}: delete them (in Blender: merge "
+            "vertices by distance)"
         )
-    edges = np.concatenate([a * vertices + b, b * vertices + c, c * vertices + a])
-    repeated = np.unique(_repeated(edges))
+    edges = triangles * vertices + np.roll(triangles, -1, axis=1)
+    repeated = np.unique(repeated_numbers(edges.ravel()))
     if len(repeated):
         raise UnfitFileError(
             "must be a manifold: at most two triangles share an edge, turned alike; "
             f"{len(repeated)} edges are not so: turn all faces to one side (in Blender: Mesh, "
             "Normals, Recalculate Outside), and delete faces inside"
         )
-
-
-def _repeated(numbers: Indices) -> Indices:
-    """Return each number after the first that is equal to it, ascending: of 5, 5, 5 two."""
-    ordered = np.sort(numbers)
-    return np.asarray(ordered[1:][ordered[1:] == ordered[:-1]])
 
 
 def _check_areas(vertices: Floats, triangles: Indices) -> None:

@@ -54,6 +54,12 @@ def weld(columns: Floats) -> Weld:
     return Weld(first[order], ranks[inverse.reshape(-1)])
 
 
+def repeated_numbers(numbers: Indices) -> Indices:
+    """Return each number after the first that is equal to it, ascending: of 5, 5, 5 two."""
+    ordered = np.sort(numbers)
+    return np.asarray(ordered[1:][ordered[1:] == ordered[:-1]])
+
+
 def _may_repeat(columns: Floats) -> bool:
     """Return False if no two rows of `columns` (N, K) are equal: comparing rows takes longer."""
     if columns.shape[1] > len(_WEIGHTS):
