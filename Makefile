@@ -8,9 +8,9 @@ PIP_FLAGS = --quiet --disable-pip-version-check
 # Python keeps what it compiled, also where the environment says otherwise: tests would be compiled by every process.
 export PYTHONDONTWRITEBYTECODE =
 
-SOURCES = $(addsuffix /src,schemas services testing training workers workers/blender) sim_core/python examples benchmarks tools
+SOURCES = $(addsuffix /src,schemas measure services testing training workers workers/blender) sim_core/python examples benchmarks tools
 # Modules of tests are named from here on: different components have some of the same name. The other tests are not typed.
-TESTS = $(addsuffix /tests,schemas services sim_core) tests
+TESTS = $(addsuffix /tests,schemas measure services sim_core) tests
 PYPROJECTS = $(wildcard */pyproject.toml) workers/blender/pyproject.toml VERSION
 CORE_SOURCES = $(shell find sim_core/src sim_core/cmake sim_core/tests/core -type f) sim_core/CMakeLists.txt sim_core/pyproject.toml
 RASTER_SOURCES = $(wildcard workers/blender/raster/* workers/blender/cmake/*) \
@@ -19,7 +19,7 @@ RASTER_SOURCES = $(wildcard workers/blender/raster/* workers/blender/cmake/*) \
 # takes half an hour. render_cloth.py needs a trajectory, which render_trajectory.py simulates for a minute, and then renders for an hour.
 BENCHMARKS = $(filter-out $(addprefix benchmarks/, render_rod_set.py cloth_contact.py render_cloth.py render_trajectory.py \
   reader.py yarn.py),$(wildcard benchmarks/*.py))
-DISTRIBUTIONS = schemas sim_core services training workers workers/blender
+DISTRIBUTIONS = schemas sim_core measure services training workers workers/blender
 CPP_FILES = $(shell find sim_core/src sim_core/tests/core workers/blender/raster -name "*.[ch]pp")
 
 .PHONY: setup setup-dev demo test-fast test test-kernels test-slow test-main test-blender test-without-blender test-core check size density docs bench wheels release-wheels release-check constraints clean
@@ -146,7 +146,7 @@ wheels: setup-dev
 
 # In CI, with Docker: manylinux wheels of the two compiled distributions; their pyproject.toml configures cibuildwheel.
 release-wheels: setup-dev
-	@for distribution in schemas services training workers; do $(PY) -m build --outdir dist $$distribution || exit 1; done
+	@for distribution in schemas measure services training workers; do $(PY) -m build --outdir dist $$distribution || exit 1; done
 	@for distribution in sim_core workers/blender; do \
 	  $(PY) -m build --sdist --outdir dist $$distribution || exit 1; \
 	  .venv/bin/pip install $(PIP_FLAGS) "cibuildwheel>=4.3,<5"; \

@@ -18,9 +18,10 @@ import argparse
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from stickslip_blender.cloth.clips import ClothRenderer
+from stickslip_blender.cloth.clips import ClipRenderer, ClothRenderer
 from stickslip_blender.cloth.geometry import Holders
 from stickslip_blender.cloth.quality import errors, measured_group, pool_errors
 from stickslip_blender.cloth.textures import texture_image
@@ -30,13 +31,17 @@ from stickslip_schemas.spec.cameras import rig_cameras, rig_digest
 from stickslip_schemas.spec.names import Texture
 from stickslip_schemas.spec.resolution import DEFAULT_RESOLUTION
 
-SHOWN = (
+VIEWS = (
     ("left", "matt", "drawn", "21"),
     ("calibrated", "stainless-steel", "drawn", "22"),
     ("right", "cloth", "drawn", "23"),
 )
 TEXTURES = tuple(map(str, Texture))[:8]
 LONG = 32  # paths per pixel of a shading, four in each of a picture
+
+
+View = tuple[str, str, str, int]
+"""Viewpoint, floor, lighting and seed of a clip."""
 
 
 def parsed() -> argparse.Namespace:
@@ -57,74 +62,84 @@ def parsed() -> argparse.Namespace:
     return arguments.parse_args()
 
 
+def settings(view: View, options: argparse.Namespace, frame_count: int) -> ClothDragRender:
+    """Return the render document of a clip of a trajectory with `frame_count` frames."""
+    viewpoint, substrate, lighting, seed = view
+    return ClothDragRender(
+        rig="drag",
+        rig_digest=rig_digest("drag"),
+        quality=options.quality,
+        material=options.material,
+        texture=TEXTURES[0],
+        resolution=tuple(options.resolution),
+        viewpoint=viewpoint,
+        substrate=substrate,
+        lighting=lighting,
+        instants=shown_frames(options.frames, frame_count),
+        light_seed=seed,
+        crease_seed=1,
+    )
+
+
+def compare(view: View, clip: ClipRenderer, options: argparse.Namespace) -> None:
+    """Print what a clip costs, and the PSNR that it states beside that of longer references."""
+    textures = TEXTURES[: options.textures]
+    pictures = {str(name): texture_image(name) for name in Texture}
+    start = time.process_time()
+    shading = clip.shading()
+    videos, _ = clip.clips(shading, [pictures[name] for name in textures])
+    rendered = time.process_time() - start
+
+    # The clip measures itself, a group of textures at a time.
+    groups = list(dict.fromkeys(map(measured_group, textures)))
+    references: list[list[Any]] = []
+    for group in groups:
+        frames = clip.measured_frames(options.measured, group)
+        references.append(list(clip.references([pictures[name] for name in group], frames)))
+    weights, mean_weights = clip.weights(shading)
+    measuring = time.process_time() - start - rendered
+    seconds = rendered / len(textures) / options.frames
+    print(
+        f"{', '.join(view[:3])}: {seconds:.4f} CPU s a frame and texture, measuring "
+        f"{100 * measuring / rendered:.0f} % more, at {len(references[0])} instants",
+        flush=True,
+    )
+
+    # Other seeds draw other paths, so these references share no noise with the clip.
+    fresh_clip = replace(clip, seed=view[3] + 5000)
+    instants = range(options.first, options.frames, options.every)
+    long = list(fresh_clip.references([pictures[name] for name in groups[0]], instants, LONG))
+    for channel, name in enumerate(groups[0]):
+        if name not in textures:
+            continue
+        video = videos[textures.index(name)]
+        stated = pool_errors(
+            [
+                (errors(video[frame], light, channel), weights[frame])
+                for frame, light in references[0]
+            ],
+            mean_weights,
+        )
+        measured = pool_errors(
+            [(errors(video[frame], light, channel), weights[frame] > 0.0) for frame, light in long]
+        )
+        regions = zip(stated.psnr, stated.deviations, measured.psnr, strict=True)
+        texts = [f"{psnr:.1f} +- {sigma:.1f} against {truth:.1f}" for psnr, sigma, truth in regions]
+        print(f"  {name}:", "; ".join(texts), flush=True)
+
+
 def main() -> None:
+    """Compare the clips of some views."""
     options = parsed()
     with np.load(options.trajectory) as file:
         track = file["track"]
         renderer = ClothRenderer(file["triangles"], file["rest"], Holders)
-    size = tuple(options.resolution)
-    textures = TEXTURES[: options.textures]
-    pictures = {str(name): texture_image(name) for name in Texture}
-    for viewpoint, substrate, lighting, number in options.shown or SHOWN:
-        seed = int(number)
-        look = ClothDragRender(
-            rig="drag",
-            rig_digest=rig_digest("drag"),
-            quality=options.quality,
-            material=options.material,
-            texture=textures[0],
-            resolution=size,
-            viewpoint=viewpoint,
-            substrate=substrate,
-            lighting=lighting,
-            instants=shown_frames(options.frames, len(track)),
-            light_seed=seed,
-            crease_seed=1,
-        )
-        camera = next(camera for camera in rig_cameras("drag", size) if camera.name == viewpoint)
-        clip = renderer.clip(look, camera, track[list(look.instants)])
-        start = time.process_time()
-        shading = clip.shading()
-        videos, _ = clip.clips(shading, [pictures[name] for name in textures])
-        made = time.process_time()
-        groups = list(dict.fromkeys(map(measured_group, textures)))
-        own = [
-            list(
-                clip.references([pictures[x] for x in g], clip.measured_frames(options.measured, g))
-            )
-            for g in groups
-        ]
-        weights, usual = clip.weights(shading)
-        ended = time.process_time()
-        others = replace(clip, seed=seed + 5000)
-        instants = range(options.first, options.frames, options.every)
-        long = list(others.references([pictures[name] for name in groups[0]], instants, LONG))
-        seconds = (made - start) / len(textures) / options.frames
-        print(
-            f"{viewpoint}, {substrate}, {lighting}: {seconds:.4f} CPU s a frame and texture",
-            end=", ",
-        )
-        print(
-            f"measuring {100 * (ended - made) / (made - start):.0f} % more, at {len(own[0])} "
-            "instants",
-            flush=True,
-        )
-        for channel, name in enumerate(groups[0]):
-            if name not in textures:
-                continue
-            video = videos[textures.index(name)]
-            stated = pool_errors(
-                [(errors(video[f], lit, channel), weights[f]) for f, lit in own[0]], usual
-            )
-            found = pool_errors(
-                [(errors(video[f], lit, channel), weights[f] > 0.0) for f, lit in long]
-            )
-            said = zip(stated.psnr, stated.deviations, found.psnr, strict=True)
-            print(
-                f"  {name}:",
-                "; ".join(f"{a:.1f} +- {d:.1f} against {b:.1f}" for a, d, b in said),
-                flush=True,
-            )
+    cameras = {camera.name: camera for camera in rig_cameras("drag", tuple(options.resolution))}
+    for viewpoint, substrate, lighting, seed in options.shown or VIEWS:
+        view = (viewpoint, substrate, lighting, int(seed))
+        document = settings(view, options, len(track))
+        instants = list(document.instants)
+        compare(view, renderer.clip(document, cameras[viewpoint], track[instants]), options)
 
 
 if __name__ == "__main__":

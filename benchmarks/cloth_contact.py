@@ -132,16 +132,16 @@ def tumble_all(only: str) -> None:
     for name in tumbles.TUMBLES:
         if not name.startswith(only):
             continue
-        seen = tumbles.watch(tumbles.tumble(name))
+        tumble = tumbles.watch(tumbles.tumble(name))
         print(
-            f"{name:11} {seen.seconds:7.2f} CPU s, {seen.unconverged_steps:3d} of {seen.steps:3d} "
-            "steps unconverged, "
-            f"{seen.crossing_steps:3d} cross, least distance {seen.least_distance:.4f} "
+            f"{name:11} {tumble.seconds:7.2f} CPU s, "
+            f"{tumble.unconverged_steps:3d} of {tumble.steps:3d} steps unconverged, "
+            f"{tumble.crossing_steps:3d} cross, least distance {tumble.least_distance:.4f} "
             "thicknesses, "
-            f"{seen.newton / seen.steps:6.1f} iterations a step",
+            f"{tumble.newton / tumble.steps:6.1f} iterations a step",
             flush=True,
         )
-        if seen.crossing_steps or seen.unconverged_steps > UNCONVERGED_SHARE_MAX * seen.steps:
+        if tumble.crossing_steps or tumble.unconverged_steps > UNCONVERGED_SHARE_MAX * tumble.steps:
             failed.append(name)
     print(
         f"beyond a share of {UNCONVERGED_SHARE_MAX:g} unconverged, or crossing: "
@@ -150,9 +150,9 @@ def tumble_all(only: str) -> None:
 
 
 def momentum(name: str, steps: int) -> None:
-    seen = tumbles.tumble(name)
-    tumbles.watch(seen, steps)
-    sums = tumbles.balance(seen.cloth)
+    tumble = tumbles.tumble(name)
+    tumbles.watch(tumble, steps)
+    sums = tumbles.balance(tumble.cloth)
     unit = THICKNESS * sums.size
     print(
         f"{name} after {steps} steps, {sums.pairs} pairs, over the sum of their sizes (times the "
@@ -244,15 +244,15 @@ def main() -> None:
     parser.add_argument(
         "--figures", type=Path, help="folder to draw the pictures of the documentation into"
     )
-    given = parser.parse_args()
-    for part in given.parts:
+    options = parser.parse_args()
+    for part in options.parts:
         if part not in parts:
             parser.error(f"parts: must be of {', '.join(parts)}, got {part}")
-    for part in given.parts or parts:
+    for part in options.parts or parts:
         if part == "protocols":
-            measure_all(given.only, given.figures)
+            measure_all(options.only, options.figures)
         else:
-            PARTS[part](given.only)
+            PARTS[part](options.only)
 
 
 if __name__ == "__main__":

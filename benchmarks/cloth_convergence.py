@@ -73,11 +73,12 @@ def compare(
 ) -> None:
     distance = 1e3 * np.linalg.norm(a - b, axis=-1)
     steady = distance[(times > STEADY[0]) & (times < STEADY[1])]
-    for label, some in (("all frames", distance), ("steady drag", steady)):
-        if some.size:
+    for label, distances in (("all frames", distance), ("steady drag", steady)):
+        if distances.size:
             print(
-                f"  {name:24s} {label:12s} median {np.median(some):7.3f}  mean {some.mean():7.3f}  "
-                f"p95 {np.quantile(some, 0.95):7.3f}  max {some.max():7.3f} mm"
+                f"  {name:24s} {label:12s} median {np.median(distances):7.3f}  "
+                f"mean {distances.mean():7.3f}  "
+                f"p95 {np.quantile(distances, 0.95):7.3f}  max {distances.max():7.3f} mm"
             )
 
 

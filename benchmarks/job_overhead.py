@@ -168,9 +168,9 @@ def main() -> None:
             "ms a task"
         )
         outside += seconds
-    kept = sum(stages[stage] for stage in ("simulate", "render", "pack") if stage in stages)
+    work = sum(stages[stage] for stage in ("simulate", "render", "pack") if stage in stages)
     print(
-        f"outside simulate, render and pack: {total - kept:.2f} CPU s, {(total - kept) / total:.1%}"
+        f"outside simulate, render and pack: {total - work:.2f} CPU s, {(total - work) / total:.1%}"
     )
 
 

@@ -91,7 +91,7 @@ class Worker:
         return answer.raise_for_status().json()  # type: ignore[no-any-return]
 
 
-def told(seconds: list[float]) -> dict[str, float]:
+def summarise(seconds: list[float]) -> dict[str, float]:
     """Return the median, the 99th percentile and the longest of some times [s]."""
     ordered = sorted(seconds)
     return {
@@ -131,8 +131,8 @@ def plan(samples: int) -> dict[str, Any]:
         result["coordinator_cpu_seconds"] = round(cpu_seconds(pid) - cpu, 1)
         result["state"], result["tasks"] = job["state"], job["progress"]["total"]
         result["lease_seconds_before"], result["lease_seconds_while_planning"] = (
-            told(before),
-            told(during),
+            summarise(before),
+            summarise(during),
         )
         result["coordinator_peak_mb"] = round(peak_megabytes(pid), 1)
         if (file := Path(directory) / "coordinator.sqlite3").exists():
@@ -153,8 +153,8 @@ def plan(samples: int) -> dict[str, Any]:
             round(time.perf_counter() - begin, 1),
         )
         result["lease_seconds_while_cancelling"], result["read_seconds_while_cancelling"] = (
-            told(leases),
-            told(reads),
+            summarise(leases),
+            summarise(reads),
         )
     return result
 
@@ -206,12 +206,12 @@ def publish(samples: int, delay: float) -> dict[str, Any]:
     return result
 
 
-def _alone(what: str, *arguments: object) -> dict[str, Any]:
+def _alone(part_name: str, *arguments: object) -> dict[str, Any]:
     """Run a part in a process of its own."""
-    command = [sys.executable, __file__, what, *map(str, arguments)]
+    command = [sys.executable, __file__, part_name, *map(str, arguments)]
     done = subprocess.run(command, stdout=subprocess.PIPE, check=True, text=True)
-    found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    return found
+    document: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return document
 
 
 def _timed(result: dict[str, Any], name: str, work: Callable[[], Any]) -> Any:
@@ -223,15 +223,15 @@ def _timed(result: dict[str, Any], name: str, work: Callable[[], Any]) -> Any:
 
 
 def _coordinate(data: Path, samples: int, delay: float) -> dict[str, Any]:
-    made = Context.open(Settings.chosen(data=data, durable=False))
-    start(made)
-    worker = PretendWorker(DirectApi(made), made.store).register()
-    job = submit_job(made, parsed(spec(samples, start=0.0) | {"views": None}), None)
-    Planner(made).run()
+    context = Context.open(Settings.chosen(data=data, durable=False))
+    start(context)
+    worker = PretendWorker(DirectApi(context), context.store).register()
+    job = submit_job(context, parsed(spec(samples, start=0.0) | {"views": None}), None)
+    Planner(context).run()
     result: dict[str, Any] = {"planned_peak_mb": round(peak_megabytes(os.getpid()), 1)}
-    _say_that_all_has_ended(made, DirectoryStore(data / "store"))
+    _say_that_all_has_ended(context, DirectoryStore(data / "store"))
     result["before_peak_mb"] = round(peak_megabytes(os.getpid()), 1)
-    made.store = slow = SlowStore(data / "store")
+    context.store = slow = SlowStore(data / "store")
     slow.delay = delay
     (lease,) = _timed(result, "compose", lambda: worker.lease(publish=1))
     result["lease_kb"] = round(len(lease.model_dump_json()) / 1e3, 1)
@@ -248,17 +248,17 @@ def _coordinate(data: Path, samples: int, delay: float) -> dict[str, Any]:
         result, "check", lambda: worker.report((lease, TaskResult.model_validate(output)))
     )
     result["peak_mb"] = round(peak_megabytes(os.getpid()), 1)
-    with made.database.read() as connection:
+    with context.database.read() as connection:
         state = connection.scalar(text("SELECT state FROM jobs"))
     assert (verdict, state) == (["accepted"], "succeeded"), (verdict, state, job)
-    made.close()
+    context.close()
     return result | {"worker": answer}
 
 
-def _say_that_all_has_ended(made: Context, store: DirectoryStore) -> None:
+def _say_that_all_has_ended(context: Context, store: DirectoryStore) -> None:
     """Write results of all tasks but the last into the database, as if they had been reported."""
     record = RecordRef(digest=store.publish(b"a record"), row=0)
-    with made.database.write() as connection:
+    with context.database.write() as connection:
         simulated = SimulateOutput(record=record, labels={}).model_dump_json()
         update = text(
             "UPDATE tasks SET state = 'succeeded', output = :output, digest = :digest, waiting_on "
@@ -273,15 +273,15 @@ def _say_that_all_has_ended(made: Context, store: DirectoryStore) -> None:
         simulations = connection.execute(of_stage, {"stage": "simulate"}).all()
         connection.execute(update, [end(row, simulated) for row in simulations])
         packs = connection.execute(of_stage, {"stage": "pack"}).all()
-        outputs = _packed(made, store, [json.loads(row.payload)["shard"] for row in packs])
+        outputs = _packed(context, store, [json.loads(row.payload)["shard"] for row in packs])
         for row, output in zip(packs, outputs, strict=True):
             connection.execute(update, end(row, output.model_dump_json()))
         connection.execute(text("UPDATE tasks SET waiting_on = 0 WHERE stage = 'publish'"))
 
 
-def _packed(made: Context, store: DirectoryStore, shards: list[int]) -> Iterator[PackOutput]:
+def _packed(context: Context, store: DirectoryStore, shards: list[int]) -> Iterator[PackOutput]:
     """Yield outputs of the packs of a job of rods without pictures: curves that are all equal."""
-    with made.database.read() as connection:
+    with context.database.read() as connection:
         row = connection.execute(text("SELECT seq, spec FROM jobs")).one()
         of_spec = parsed(json.loads(row.spec))
         rows = text(
@@ -300,20 +300,20 @@ def _packed(made: Context, store: DirectoryStore, shards: list[int]) -> Iterator
         ]
         sizes = {digest: store.size(digest) for digests in shapes for digest in digests}
         for shard in shards:
-            found = connection.execute(
+            samples_of_shard = connection.execute(
                 rows, {"job": row.seq, "first": shard * size, "end": (shard + 1) * size}
             ).all()
-            labels = [json.loads(sample.labels) for sample in found]
+            labels = [json.loads(sample.labels) for sample in samples_of_shard]
             columns = []
             for array in layout(of_spec):
                 if array.is_label:
-                    values = np.zeros((len(found), *array.shape), array.dtype)
+                    values = np.zeros((len(samples_of_shard), *array.shape), array.dtype)
                     if array.name == "sample_key":
                         values[:] = np.frombuffer(
-                            b"".join(sample.key for sample in found), np.uint8
+                            b"".join(sample.key for sample in samples_of_shard), np.uint8
                         ).reshape(-1, 32)
                     elif array.name == "split":
-                        values[:] = [sample.split for sample in found]
+                        values[:] = [sample.split for sample in samples_of_shard]
                     elif array.name == "valid":
                         values[:] = True
                     elif array.name in labels[0]:
@@ -334,8 +334,8 @@ def _work(task: Path, store: Path, delay: float) -> dict[str, Any]:
     slow = SlowStore(store)
     slow.delay = delay
     result: dict[str, Any] = {}
-    given = PublishTask.model_validate_json(task.read_bytes())
-    done = _timed(result, "publish", lambda: publish(given, slow))
+    task_document = PublishTask.model_validate_json(task.read_bytes())
+    done = _timed(result, "publish", lambda: publish(task_document, slow))
     result["peak_mb"] = round(peak_megabytes(os.getpid()), 1)
     return result | {"output": done.model_dump(mode="json")}
 
@@ -346,8 +346,8 @@ def _read(version: Path) -> dict[str, Any]:
     result: dict[str, Any] = {"before_mb": round(peak_megabytes(os.getpid()), 1)}
     reader = _timed(result, "open", lambda: DatasetReader(version))
     slots = _timed(result, "list", lambda: reader.slots("train"))
-    found = _timed(result, "filter", lambda: slots[reader.label("gamma")[slots] < 10.0])
-    result["found"] = [len(reader), len(slots), len(found)]
+    slots_of_label = _timed(result, "filter", lambda: slots[reader.label("gamma")[slots] < 10.0])
+    result["found"] = [len(reader), len(slots), len(slots_of_label)]
     result["peak_mb"] = round(peak_megabytes(os.getpid()), 1)
     _timed(result, "sample", lambda: reader.read("centerline", [len(reader) // 2]))
     result["with_a_sample_peak_mb"] = round(peak_megabytes(os.getpid()), 1)
@@ -357,7 +357,7 @@ def _read(version: Path) -> dict[str, Any]:
 def main() -> None:
     """Measure and print."""
     if sys.argv[1:2] and sys.argv[1].startswith("_"):
-        what, *given = sys.argv[1:]
+        part_name, *part_arguments = sys.argv[1:]
         parts: dict[str, Callable[..., dict[str, Any]]] = {
             "_coordinate": lambda data, samples, delay: _coordinate(
                 Path(data), int(samples), float(delay)
@@ -365,7 +365,7 @@ def main() -> None:
             "_work": lambda task, store, delay: _work(Path(task), Path(store), float(delay)),
             "_read": lambda version: _read(Path(version)),
         }
-        print(json.dumps(parts[what](*given)))
+        print(json.dumps(parts[part_name](*part_arguments)))
         return
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter

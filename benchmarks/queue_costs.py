@@ -134,13 +134,13 @@ async def report_watchers(
         await asyncio.to_thread(thread.join)
         await client.post(f"/v1/jobs/{job}:cancel")
         await asyncio.wait_for(asyncio.gather(*watchers), 60)
-    told = {
+    answers = {
         tuple(dict.fromkeys(a for a, b in itertools.pairwise(ids) if "job.state" in b))
         for ids in heard
     }
     print(
         f"{count} watchers: {share:.0%} of a core; every one heard the same states: "
-        f"{len(told) == 1}"
+        f"{len(answers) == 1}"
     )
 
 
@@ -248,11 +248,11 @@ async def report_idle_streams(
     writers: list[asyncio.StreamWriter] = []
 
     async def open_stream(number: int) -> None:
-        which = number // MAX_STREAMS
+        client_number = number // MAX_STREAMS
         reader, writer = await asyncio.open_connection(
-            host, int(port), local_addr=(f"127.0.0.{1 + which}", 0)
+            host, int(port), local_addr=(f"127.0.0.{1 + client_number}", 0)
         )
-        writer.write(f"{request}{keys[which]}\r\n\r\n".encode())
+        writer.write(f"{request}{keys[client_number]}\r\n\r\n".encode())
         statuses[(await reader.readline()).split()[1]] += 1
         writers.append(writer)
         with suppress(OSError):
@@ -297,13 +297,17 @@ def report_heartbeats(
     counts = [0] * senders
     requests = []
     for number in range(senders):
-        one = PretendWorker(worker.api, server.store, name=f"beats-{number}").register()
+        worker_of_client = PretendWorker(
+            worker.api, server.store, name=f"beats-{number}"
+        ).register()
         leases = tuple(
             LeaseState(task_id=i.task_id, token=i.token, started=False)
-            for i in one.lease(simulate=held)
+            for i in worker_of_client.lease(simulate=held)
         )
         assert len(leases) == held
-        body = Heartbeat(worker_id=one.id, leases=leases, condition=one.condition).model_dump_json()
+        body = Heartbeat(
+            worker_id=worker_of_client.id, leases=leases, condition=worker_of_client.condition
+        ).model_dump_json()
         lines = f"Host: {host}", f"Authorization: Bearer {key}", "Content-Type: application/json"
         head = "\r\n".join(
             ["POST /v1/worker/heartbeat HTTP/1.1", *lines, f"Content-Length: {len(body)}"]
@@ -322,13 +326,13 @@ def report_heartbeats(
                 counts[number] += 1
 
     threads = [threading.Thread(target=send, args=(number,)) for number in range(senders)]
-    cpu, other, own = cpu_seconds(server), database_seconds(), time.process_time()
+    cpu, other, own_cpu = cpu_seconds(server), database_seconds(), time.process_time()
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
     total = sum(counts)
-    took = (cpu_seconds(server) - cpu, database_seconds() - other, time.process_time() - own)
+    took = (cpu_seconds(server) - cpu, database_seconds() - other, time.process_time() - own_cpu)
     spent, database, sender = (1e3 * seconds / total for seconds in took)
     print(
         f"heartbeats with {held} leases, {senders} workers: {total / seconds:.0f} a second beside "

@@ -35,7 +35,7 @@ Bytes = NDArray[np.uint8]
 Draw = Callable[[list[int]], Any]
 
 
-def ours(root: Path, clips: Bytes, scratch: Path) -> Iterator[tuple[str, Draw]]:
+def stickslip_reader(root: Path, clips: Bytes, scratch: Path) -> Iterator[tuple[str, Draw]]:
     """Yield our reader with new buffers and with a ring of two, which training uses."""
     fresh, ring = Samples(root), Samples(root, ring=2)
     yield "ours, new buffers", lambda indices: fresh.__getitems__(indices)["video"]
@@ -132,7 +132,7 @@ def webdataset(root: Path, clips: Bytes, scratch: Path) -> Iterator[tuple[str, D
     yield "WebDataset, .npy", draw
 
 
-READERS = (ours, zarr_python, tensorstore, npy, h5py, streaming, webdataset)
+READERS = (stickslip_reader, zarr_python, tensorstore, npy, h5py, streaming, webdataset)
 PACKAGES = {"ours": None, "zarr_python": "zarr", "npy": None}
 
 
@@ -170,13 +170,13 @@ def packages() -> str:
         "webdataset",
         "torch",
     )
-    found = []
+    versions = []
     for name in names:
         try:
-            found.append(f"{name} {version(name)}")
+            versions.append(f"{name} {version(name)}")
         except PackageNotFoundError:
             continue
-    return ", ".join(found)
+    return ", ".join(versions)
 
 
 def main() -> None:

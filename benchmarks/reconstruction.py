@@ -54,7 +54,7 @@ DOWN = np.array([0.0, 0.0, -1.0])
 class Judged:
     """One rod: its reconstruction, and how far off it is [L]."""
 
-    found: Reconstruction
+    reconstruction: Reconstruction
     error: Floats
     """Distance at each point, (150,)."""
     seconds: float
@@ -72,23 +72,23 @@ def draw_rods(count: int, seed: int, family: str = "thesis") -> dict[str, Floats
     """
     random, rig = np.random.Generator(np.random.PCG64(seed)), load_rig(RIG)
     ranges = HARD_RANGES if family == "hard" else RANGES
-    made = {name: random.uniform(*bounds, 2 * count) for name, bounds in ranges.items()}
+    parameters = {name: random.uniform(*bounds, 2 * count) for name, bounds in ranges.items()}
     if family == "varying":
         k, s = np.arange(1, WAVES + 1)[:, None], np.linspace(0.0, 1.0, 150)
         amplitudes = DEVIATION / k * random.normal(size=(2 * count, WAVES, 3))
-        mean = np.stack([made["phi0"], 0 * made["phi0"], made["phi1"]], axis=1)
+        mean = np.stack([parameters["phi0"], 0 * parameters["phi0"], parameters["phi1"]], axis=1)
         natural = mean[:, None] + np.einsum("nki,ks->nsi", amplitudes, np.cos(np.pi * k * s))
-        made = {"gamma": made["gamma"], "natural": natural}
-        solution = solve_general_rods(natural, made["gamma"])
+        parameters = {"gamma": parameters["gamma"], "natural": natural}
+        solution = solve_general_rods(natural, parameters["gamma"])
     else:
-        solution = solve_rods(*made.values())
+        solution = solve_rods(*parameters.values())
     lines, strains = solution.centerline, solution.curvature
-    seen = [all(camera.overflow(line, RADIUS) <= 0.0 for camera in rig) for line in lines]
-    kept = np.flatnonzero(np.array(seen) & solution.stable)[:count]
+    is_in_frame = [all(camera.overflow(line, RADIUS) <= 0.0 for camera in rig) for line in lines]
+    rods = np.flatnonzero(np.array(is_in_frame) & solution.stable)[:count]
     return {
-        "centerline": lines[kept],
-        "strains": strains[kept],
-        **{name: row[kept] for name, row in made.items()},
+        "centerline": lines[rods],
+        "strains": strains[rods],
+        **{name: row[rods] for name, row in parameters.items()},
     }
 
 
@@ -113,9 +113,9 @@ def rendered(
 
 def judge(views: npt.NDArray[np.uint8], true: Floats) -> Judged:
     start = time.process_time()
-    found = reconstruct(views, load_rig(RIG))
+    reconstruction = reconstruct(views, load_rig(RIG))
     seconds = time.process_time() - start
-    return Judged(found, np.linalg.norm(found.centerline - true, axis=1), seconds)
+    return Judged(reconstruction, np.linalg.norm(reconstruction.centerline - true, axis=1), seconds)
 
 
 def thesis_error(pictures: npt.NDArray[np.uint8], true: Floats) -> float:
@@ -151,14 +151,14 @@ def print_report(judged: list[Judged], thesis: list[float]) -> None:
     seconds = np.array([item.seconds for item in judged])
     print(f"CPU s a rod: median {np.median(seconds):.2f}, p95 {np.quantile(seconds, 0.95):.2f}")
     bad = np.array([item.bad for item in judged])
-    flagged = np.array([item.found.verdict != Verdict.good for item in judged])
+    flagged = np.array([item.reconstruction.verdict != Verdict.good for item in judged])
     print(f"failures (mean > {BAD:.1%} or largest > {4 * BAD:.1%}): {bad.sum()} of {len(bad)}")
     print(
         f"flagged: {flagged.sum()}; of the failures {(flagged & bad).sum()} of {bad.sum()}, "
         f"of the others {(flagged & ~bad).sum()} of {(~bad).sum()}"
     )
     for name in ("misfit", "unexplained", "unsupported", "residual_rms"):
-        values = np.array([getattr(item.found, name) for item in judged])
+        values = np.array([getattr(item.reconstruction, name) for item in judged])
         good = values[~bad]
         worst = f"{values[bad].min():.3f} to {values[bad].max():.3f}" if bad.any() else "-"
         print(
@@ -190,25 +190,25 @@ def save_pictures(
             out / f"{name}.png",
             list(rods["views"][row]),
             load_rig(RIG),
-            judged[row].found.centerline,
+            judged[row].reconstruction.centerline,
             rods["centerline"][row],
         )
 
 
 def save_data(path: Path, rods: dict[str, npt.NDArray[Any]], judged: list[Judged]) -> None:
     """Write true and reconstructed centrelines."""
-    given: dict[str, Any] = {
+    arrays: dict[str, Any] = {
         name: rods[name] for name in ("strains", "natural", *RANGES) if name in rods
     }
     np.savez_compressed(
         path,
         true=rods["centerline"],
-        reconstructed=np.stack([item.found.centerline for item in judged]),
-        deviation=np.stack([item.found.deviation for item in judged]),
-        views_seen=np.stack([item.found.views_seen for item in judged]),
-        verdict=np.array([item.found.verdict.value for item in judged]),
-        misfit=np.array([item.found.misfit for item in judged]),
-        **given,
+        reconstructed=np.stack([item.reconstruction.centerline for item in judged]),
+        deviation=np.stack([item.reconstruction.deviation for item in judged]),
+        views_seen=np.stack([item.reconstruction.views_seen for item in judged]),
+        verdict=np.array([item.reconstruction.verdict.value for item in judged]),
+        misfit=np.array([item.reconstruction.misfit for item in judged]),
+        **arrays,
     )
 
 

@@ -44,7 +44,7 @@ from stickslip_blender.cloth.looks import (
     Substrate,
     drawn_light,
     drawn_substrate,
-    fabric_look,
+    fabric_appearance,
     floor_factor,
     print_on_fabric,
 )
@@ -91,7 +91,7 @@ class Bench:
         with np.load(trajectory) as file:
             self.track = file["track"].astype(np.float64)
             self.renderer = ClothRenderer(file["triangles"], file["rest"], Holders)
-        self.look = fabric_look(MATERIAL)
+        self.look = fabric_appearance(MATERIAL)
         self.pictures = {
             texture: print_on_fabric(
                 texture_image(texture), self.look, self.renderer.geometry.surface
@@ -121,9 +121,9 @@ class Bench:
         """Return the window and what it should look like."""
         shot, floor = self.set_up(view)
         window = self.scene.window(shot)
-        kept = self.references and self.references / f"{view.name}-{texture}.npy"
-        if kept is not None and kept.exists():
-            return window, np.load(kept)
+        stored = self.references and self.references / f"{view.name}-{texture}.npy"
+        if stored is not None and stored.exists():
+            return window, np.load(stored)
         camera = self.rig[view.view]
         light = np.zeros((camera.height, camera.width, 3), dtype=np.float16)
         light[window.slices] = self.scene.direct(
@@ -135,9 +135,9 @@ class Bench:
         picture = encode(light * self.scene.composer.floor_factor(shot, camera, floor))[
             window.slices
         ]
-        if kept is not None:
-            kept.parent.mkdir(parents=True, exist_ok=True)
-            np.save(kept, picture)
+        if stored is not None:
+            stored.parent.mkdir(parents=True, exist_ok=True)
+            np.save(stored, picture)
         return window, picture
 
     def composed(
@@ -180,8 +180,8 @@ class Bench:
     def cloth(self, view: View, window: Window) -> npt.NDArray[np.bool_]:
         """Return which pixels of a window the cloth covers by half or more."""
         points = self.geometry.points(self.track[view.frame], view.frame)
-        seen = see(projected(self.rig[view.view], points), self.geometry.triangles, window)
-        share: npt.NDArray[np.bool_] = seen.share_below(self.geometry.cloth_triangles) >= 0.5
+        visible = see(projected(self.rig[view.view], points), self.geometry.triangles, window)
+        share: npt.NDArray[np.bool_] = visible.share_below(self.geometry.cloth_triangles) >= 0.5
         return share
 
 
@@ -277,11 +277,11 @@ def cost_of_ground_truth(bench: Bench, chosen: list[View]) -> None:
             )
             start = time.process_time()
             truth = ground_truth(bench.geometry, now, then, bench.rig[view.view])
-            found = time.process_time()
+            end_of_measurement = time.process_time()
             for values in vars(truth).values():
                 context.chunk(values)
-            known.append(found - start)
-            written.append(time.process_time() - found)
+            known.append(end_of_measurement - start)
+            written.append(time.process_time() - end_of_measurement)
     whole = np.array(pictures)
     of_trace, of_all = (
         100 * np.median(part / whole) for part in (np.array(known), np.add(known, written))
@@ -341,10 +341,10 @@ def whole_clips(trajectory: Path, out: Path, **look_of_clip: Any) -> None:
         shape = (len(TEXTURES), len(look.instants), 224, 224, 3)
         clips = np.empty(shape, dtype=np.uint8)
         labels = []
-        for clip, own in zip(clips, result.output.clips.values(), strict=True):
-            assert isinstance(own.output, RenderOutput), own.message
-            where = own.output.chunks["video"]
-            labels.append(own.output.labels["psnr_cloth"])
+        for clip, clip_result in zip(clips, result.output.clips.values(), strict=True):
+            assert isinstance(clip_result.output, RenderOutput), clip_result.message
+            where = clip_result.output.chunks["video"]
+            labels.append(clip_result.output.labels["psnr_cloth"])
             decode_clip(store.read(where.digest, offset=where.offset, length=where.length), clip)
     np.save(out, clips)
     blender, every = spent

@@ -21,7 +21,7 @@ from stickslip_schemas.spec.cameras import load_rig
 
 REFERENCE = Sampling(samples=256, seed=1)
 """What pictures are compared with; its seed is another, so that it shares no noise with them."""
-OTHERS = {
+FURTHER_SAMPLINGS = {
     f"{samples}{'' if denoiser == 'none' else ' ' + denoiser}": Sampling(
         samples=samples, denoiser=denoiser
     )
@@ -92,7 +92,7 @@ def main() -> None:
         f"{'PSNR rod':>8}"
     )
     named: dict[str, Sampling] = {str(name): sampling for name, sampling in SAMPLING.items()}
-    for name, sampling in (named | (OTHERS if options.all else {})).items():
+    for name, sampling in (named | (FURTHER_SAMPLINGS if options.all else {})).items():
         result = measure(sampling, lines)
         quality = [
             psnr(result.views, reference.views),

@@ -76,13 +76,13 @@ def main() -> None:
         # One solution at a time: each is 180 MB.
         times = [cpu_seconds(rods, elements)[0] for _ in range(repeats)]
         solution = cpu_seconds(rods, elements)[1]
-        some = slice(None, None, SUBSAMPLE)
-        distance = np.linalg.norm(solution.centerline[some] - reference.centerline, axis=2).max(
+        nodes = slice(None, None, SUBSAMPLE)
+        distance = np.linalg.norm(solution.centerline[nodes] - reference.centerline, axis=2).max(
             axis=1
         )
         scale = np.abs(reference.curvature).max(axis=(1, 2))
-        curvature = np.abs(solution.curvature[some] - reference.curvature).max(axis=(1, 2)) / scale
-        turn = np.linalg.norm(solution.frame[some] - reference.frame, axis=(2, 3)).max(
+        curvature = np.abs(solution.curvature[nodes] - reference.curvature).max(axis=(1, 2)) / scale
+        turn = np.linalg.norm(solution.frame[nodes] - reference.frame, axis=(2, 3)).max(
             axis=1
         ) / np.sqrt(2)
         print(

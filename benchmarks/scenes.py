@@ -40,17 +40,20 @@ def spec(name: str, samples: int, *, defaults: bool) -> Any:
     """Return the spec of a scene in which all parameters vary."""
     scene = load_scene(name)
     axes: dict[str, Any] = {}
-    for dimension, (parameter, given) in enumerate(scene.parameters.items()):
+    for dimension, (parameter, parameter_range) in enumerate(scene.parameters.items()):
         default = scene.default(parameter)
         if isinstance(default, str):
-            fabrics = [str(value) for value in given.values or Material]
-            found: list[Any] = [fabrics[7 * sample % len(fabrics)] for sample in range(samples)]
+            fabrics = [str(value) for value in parameter_range.values or Material]
+            values: list[Any] = [fabrics[7 * sample % len(fabrics)] for sample in range(samples)]
         else:
             sobol = SobolAxis[float](
-                type="sobol", low=given.low or 0.0, high=given.high or 0.0, num=samples
+                type="sobol",
+                low=parameter_range.low or 0.0,
+                high=parameter_range.high or 0.0,
+                num=samples,
             )
-            found = drawn_values(sobol, dimension=dimension).tolist()
-        axes[parameter] = [default, *found[1:]] if defaults else found
+            values = drawn_values(sobol, dimension=dimension).tolist()
+        axes[parameter] = [default, *values[1:]] if defaults else values
     cameras = scene.looks.cameras
     viewpoint = next(iter(cameras)) if isinstance(cameras, dict) else "front"
     looks = {"texture": ["checker"] * samples, "viewpoint": [viewpoint] * samples}
@@ -75,10 +78,10 @@ class Clock:
     def of(self, name: str, called: Callable[..., Any]) -> Callable[..., Any]:
         """Return a function that does the same and counts its time."""
 
-        def timed(*given: Any, **named: Any) -> Any:
+        def timed(*arguments: Any, **named: Any) -> Any:
             begin = time.process_time()
             try:
-                return called(*given, **named)
+                return called(*arguments, **named)
             finally:
                 self.spent[name] += time.process_time() - begin
 
@@ -91,8 +94,8 @@ def simulated(simulation: Any, files: dict[str, bytes], keep: Path | None) -> di
     It has its code, its reason if it is not valid, and CPU seconds by part.
     """
     begin, clock = time.process_time(), Clock()
-    given = simulation.inputs(files.__getitem__)
-    scene = cloth_scene.scene(given["scene"], seed=given["seed"])
+    inputs = simulation.inputs(files.__getitem__)
+    scene = cloth_scene.scene(inputs["scene"], seed=inputs["seed"])
     set_up = time.process_time() - begin
     scene = replace(
         scene,
@@ -127,41 +130,44 @@ def row(
 ) -> dict[str, Any]:
     """Simulate samples of a scene, and return its row."""
     files, measured = dict(built_in_files()), commit()
-    made = spec(name, samples, defaults=defaults)
-    stage = made.stage
-    found: list[dict[str, Any]] = []
-    for point in made.grid():
-        if sum(each["cpu"] for each in found) > seconds:
+    job_spec = spec(name, samples, defaults=defaults)
+    stage = job_spec.stage
+    simulations: list[dict[str, Any]] = []
+    for point in job_spec.grid():
+        if sum(each["cpu"] for each in simulations) > seconds:
             break
         values = {key: value for key, value in point.items() if key in stage.parameters}
-        found.append(
-            simulated(made.simulation(point), files, keep and keep / f"{name}-{len(found)}.npz")
+        simulations.append(
+            simulated(
+                job_spec.simulation(point), files, keep and keep / f"{name}-{len(simulations)}.npz"
+            )
             | {"values": values}
         )
         print(
             name,
-            len(found),
-            f"{found[-1]['cpu']:.1f} s",
+            len(simulations),
+            f"{simulations[-1]['cpu']:.1f} s",
             values,
-            found[-1]["reason"] or "valid",
+            simulations[-1]["reason"] or "valid",
             flush=True,
         )
     vertices = sum(sheet.mesh.shape[0] for sheet in stage.sheets.values())
     length = (stage.frames - 1) / stage.frame_rate
-    cpu = [each["cpu"] for each in found]
+    cpu = [each["cpu"] for each in simulations]
     share = {
-        part: sum(each["layer"][part] for each in found) / sum(cpu) for part in found[0]["layer"]
+        part: sum(each["layer"][part] for each in simulations) / sum(cpu)
+        for part in simulations[0]["layer"]
     }
     return {
         "scene": name,
         "preset": stage.preset.value,
         "vertices": vertices,
         "scene seconds": round(length, 2),
-        "samples": len(found),
-        "valid": sum(not each["reason"] for each in found),
+        "samples": len(simulations),
+        "valid": sum(not each["reason"] for each in simulations),
         "not valid": [
             {key: each[key] for key in ("code", "reason", "values")}
-            for each in found
+            for each in simulations
             if each["reason"]
         ],
         "CPU s a sample, least, median, most": [
@@ -179,10 +185,10 @@ def row(
 
 def commit() -> str:
     """Return the commit that is measured."""
-    found = subprocess.run(
+    result = subprocess.run(
         ["git", "rev-parse", "--short=12", "HEAD"], capture_output=True, text=True, check=True
     )
-    return found.stdout.strip()
+    return result.stdout.strip()
 
 
 def main() -> None:
@@ -198,12 +204,13 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=OUT)
     args = parser.parse_args()
     for name in args.scenes or scene_names():
-        made = row(name, args.samples, args.seconds, defaults=args.defaults, keep=args.keep)
+        scene_row = row(name, args.samples, args.seconds, defaults=args.defaults, keep=args.keep)
         old = json.loads(args.out.read_text())["rows"] if args.out.exists() else []
         rows = sorted(
-            [*(each for each in old if each["scene"] != name), made], key=lambda each: each["scene"]
+            [*(each for each in old if each["scene"] != name), scene_row],
+            key=lambda each: each["scene"],
         )
-        said = {
+        record = {
             "what": "Validity and CPU time of the built-in scenes, all parameters over their "
             "declared ranges",
             "command": COMMAND,
@@ -211,7 +218,7 @@ def main() -> None:
             "conditions": "one thread; two cores shared with other work; CPU time of this process",
             "rows": rows,
         }
-        args.out.write_text(json.dumps(said, indent=1) + "\n")
+        args.out.write_text(json.dumps(record, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -96,8 +96,8 @@ def run_job(client: httpx.Client, spec: dict[str, Any]) -> tuple[float, str]:
             raise SystemExit(f"job {job}: {state['state']}, {state['message']}")
         time.sleep(0.05)
     seconds = time.perf_counter() - start
-    made = state["dataset"]
-    return seconds, f"/v1/datasets/{made['dataset']}/versions/{made['version']}"
+    dataset = state["dataset"]
+    return seconds, f"/v1/datasets/{dataset['dataset']}/versions/{dataset['version']}"
 
 
 def describe(client: httpx.Client, where: str) -> str:

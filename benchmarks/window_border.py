@@ -24,7 +24,7 @@ from stickslip_schemas.spec.arrays import shown_frames
 from stickslip_schemas.spec.cameras import load_rig, rig_digest
 from stickslip_schemas.spec.names import Texture
 
-SHOWN = (("left", "matt", 61), ("calibrated", "matt", 62), ("right", "white-table", 63))
+VIEWS = (("left", "matt", 61), ("calibrated", "matt", 62), ("right", "white-table", 63))
 FRAMES, MARGIN, WIDTH, PATHS = 30, 10, 4, 32
 
 
@@ -38,7 +38,7 @@ def main() -> None:
         track = file["track"]
         renderer = ClothRenderer(file["triangles"], file["rest"], Holders)
     picture = texture_image(Texture.checker)
-    for viewpoint, substrate, seed in SHOWN:
+    for viewpoint, substrate, seed in VIEWS:
         instants = shown_frames(FRAMES, len(track))[:: options.every]
         look = ClothDragRender(
             rig="drag",

@@ -137,8 +137,8 @@ def look_at_cloth(directory: Path) -> None:
     shapes = {name: tuple(tensor.shape) for name, tensor in batch.items()}
     console.print(f"{len(clips)} clips in one batch of {shapes}")
     video = batch["video"].numpy()
-    shown = np.linspace(0, video.shape[1] - 1, CLIP_FRAMES).round().astype(int)
-    rows = [np.concatenate(list(clip[shown]), axis=1) for clip in video]
+    frame_numbers = np.linspace(0, video.shape[1] - 1, CLIP_FRAMES).round().astype(int)
+    rows = [np.concatenate(list(clip[frame_numbers]), axis=1) for clip in video]
     save_half_size(np.concatenate(rows), OUT / "cloth-sheet.png")
 
 

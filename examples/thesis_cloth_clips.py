@@ -128,8 +128,8 @@ def _print_labels(dataset: Path) -> None:
         f"{name}, least": float(np.nanmin(np.asarray(group[name])[valid]))
         for name in ("psnr_cloth", "psnr_edge")
     }
-    found = least | {"frame_share": float(np.asarray(group["frame_share"])[valid].mean())}
-    console.print(f"  {json.dumps(found)}")
+    quality = least | {"frame_share": float(np.asarray(group["frame_share"])[valid].mean())}
+    console.print(f"  {json.dumps(quality)}")
 
 
 if __name__ == "__main__":

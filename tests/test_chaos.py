@@ -369,7 +369,7 @@ def nodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Ser
         pytest.skip("the PostgreSQL server is not installed: apt-get install postgresql")
     with postgresql_server(programs) as server, s3_proxy() as proxy:
         make_bucket(proxy, "lab")
-        proxy.some(1, FAULTS)
+        proxy.inject_faults(1, FAULTS)
         for name, value in (variables(proxy) | {"STICKSLIP_DATABASE": server.empty()}).items():
             monkeypatch.setenv(name, value)
         both = tuple(

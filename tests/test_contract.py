@@ -15,8 +15,9 @@ from stickslip_schemas.kinds.cloth.arrays import KERNELS
 from stickslip_schemas.kinds.cloth_drag import SELF_FRICTION, ClothDragSpec
 from stickslip_schemas.kinds.rod_hang import ROD_PRESET, RodHangSpec
 from stickslip_schemas.plan.points import keyed_points
+from stickslip_schemas.spec.fabrics import FabricNumbers
 from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, JobSpec, PresetName
-from stickslip_schemas.spec.names import FabricNumbers, Material
+from stickslip_schemas.spec.names import Material
 from stickslip_services.queue.plan import expand, plan_inputs_for
 from stickslip_services.queue.rows import PlanInputs
 from stickslip_sim_core._sim_core import kernels
@@ -81,22 +82,23 @@ def test_friction_has_one_range() -> None:
             "young": 1e4,
             "poisson": 0.49,
             "thickness": 2.1e-5,
-            "bending": (1e-12,) * 3,
+            "bending": (1e-9, 1e-9, 1e-12),
         },
         {
             "density": 5.0,
             "young": 1e8,
             "poisson": 0.49,
             "thickness": 0.0044,
-            "bending": (1.0,) * 3,
+            "bending": (0.049, 0.049, 1.0),
             "damping": 10.0,
         },
         {"density": 0.2, "stretching": ((1e6, 0.0, 1e6, 1e6),) * 6, "bending": (1e-5, 1e-5, 1e-6)},
+        {"density": 0.2, "stretching": "navy-sparkle-sweat", "bending": (1e-5, 1e-5, 1e-6)},
     ],
 )
 def test_the_core_takes_every_fabric_that_a_spec_may_have(numbers: dict[str, Any]) -> None:
     made = FabricNumbers.model_validate(numbers)
-    stickslip_sim_core.custom_fabric("own", **made.model_dump())
+    stickslip_sim_core.custom_fabric("own", **made.numbers())
     stiffer = {"young": 1e9, "thickness": 0.01, "poisson": 0.3, "density": 0.2}
     with pytest.raises(ValidationError, match="young times thickness must be at most 1e"):
         FabricNumbers.model_validate(stiffer)

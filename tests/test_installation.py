@@ -26,7 +26,7 @@ TEXTS = [
 ]
 SOURCES = [
     path
-    for folder in ("schemas", "services", "sim_core", "training", "workers")
+    for folder in ("schemas", "measure", "services", "sim_core", "training", "workers")
     for path in sorted((ROOT / folder).rglob("*.py"))
     if "tests" not in path.parts and "build" not in path.parts
 ]

@@ -19,8 +19,16 @@ from packaging.version import Version
 
 ROOT = Path(__file__).parents[1]
 VERSION = (ROOT / "VERSION").read_text().strip()
-DISTRIBUTIONS = ("schemas", "sim_core", "services", "training", "workers", "workers/blender")
-PURE = ("schemas", "services", "training", "workers")
+DISTRIBUTIONS = (
+    "schemas",
+    "sim_core",
+    "measure",
+    "services",
+    "training",
+    "workers",
+    "workers/blender",
+)
+PURE = ("schemas", "measure", "services", "training", "workers")
 PROJECTS = {
     name: tomllib.loads((ROOT / name / "pyproject.toml").read_text()) for name in DISTRIBUTIONS
 }

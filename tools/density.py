@@ -21,6 +21,7 @@ DISTRIBUTIONS: dict[str, tuple[str, ...]] = {
     "services": ("services/src",),
     "sim_core": ("sim_core/python",),
     "training": ("training/src",),
+    "measure": ("measure/src",),
     "workers": ("workers/src",),
     "blender": ("workers/blender/src",),
 }

@@ -19,16 +19,23 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 IN_USE = Path(__file__).with_name("names_in_use.json")
 FOLDERS = (
-    "schemas/src",
-    "services/src",
+    "schemas",
+    "services",
     "sim_core/python",
     "sim_core/src",
-    "training/src",
-    "workers/src",
-    "workers/blender/src",
-    "workers/blender/raster",
+    "sim_core/tests",
+    "training",
+    "measure",
+    "workers",
+    "testing",
+    "tests",
     "tools",
+    "benchmarks",
+    "examples",
 )
+SUFFIXES = (".py", ".cpp", ".hpp")
+GENERATED = {"build", "node_modules", ".venv", ".venv-blender"}
+"""Folders that hold no source of this project."""
 
 PRIVATE = {
     "asker": "principal",
@@ -57,8 +64,13 @@ PRIVATE = {
 }
 """Words that mislead a reader of the field, and the terms to use."""
 
-PRONOUNS = ("found", "given", "kept", "made", "mine", "one", "own", "seen", "shown", "some", "told")
-"""Pronouns and participles: a variable is named after the thing that it holds."""
+PRONOUNS = ("mine", "one", "others", "ours", "own", "some", "what", "which", "who", "whom")
+PARTICIPLES = ("found", "given", "kept", "made", "ran", "said", "seen", "shown", "taken", "told")
+"""Pronouns and participles: a variable is named after the thing that it holds.
+
+A participle that the field uses as a noun or as an adjective stays: `held` vertices, a `known`
+curvature, the `expected` value.
+"""
 
 
 def python_names(text: str) -> set[str]:
@@ -67,6 +79,8 @@ def python_names(text: str) -> set[str]:
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Name):
             names.add(node.id)
+        elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
+            names.add(node.attr)
         elif isinstance(node, ast.arg):
             names.add(node.arg)
         elif isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
@@ -86,7 +100,7 @@ def refused_words(path: Path) -> set[str]:
     names = python_names(text) if path.suffix == ".py" else cpp_names(text)
     # A private name begins with an underscore, and a name that a keyword takes ends with one.
     words = {name.strip("_").lower() for name in names}
-    return words & {*PRIVATE, *PRONOUNS}
+    return words & {*PRIVATE, *PRONOUNS, *PARTICIPLES}
 
 
 def words_in_use() -> dict[str, list[str]]:
@@ -95,7 +109,7 @@ def words_in_use() -> dict[str, list[str]]:
     for folder in FOLDERS:
         for path in sorted((ROOT / folder).rglob("*")):
             parts = path.relative_to(ROOT).parts
-            if path.suffix in (".py", ".cpp", ".hpp") and not {"tests", "build"} & set(parts):
+            if path.suffix in SUFFIXES and not GENERATED & set(parts):
                 refused = refused_words(path)
                 if refused:
                     words[path.relative_to(ROOT).as_posix()] = sorted(refused)

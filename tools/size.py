@@ -15,6 +15,7 @@ FOLDERS = (
     "services/src",
     "workers",
     "training/src",
+    "measure/src",
     "sim_core/src",
     "sim_core/python",
 )

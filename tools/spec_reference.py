@@ -12,8 +12,9 @@ from stickslip_schemas.base import Document
 from stickslip_schemas.kinds import KINDS
 from stickslip_schemas.kinds.cloth.spec import ClipSpec
 from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
+from stickslip_schemas.spec.fabrics import FabricDistribution, FabricNumbers, FabricRanges
 from stickslip_schemas.spec.jobs import JobSpec
-from stickslip_schemas.spec.names import Calibration, FabricNumbers, FloorNumbers, LampNumbers
+from stickslip_schemas.spec.names import Calibration, FloorNumbers, LampNumbers
 
 HEAD = """# Every key of a spec
 
@@ -38,7 +39,9 @@ An axis, under `axes`, has one of these forms:
 
 A random or Sobol axis may have a `seed`, 0 by default.
 
-An axis of names, such as `material`, takes one name or a list. A job has at most 1,000,000 samples.
+An axis of names, such as `material`, takes one name or a list. An axis of fabrics may draw them:
+`{distribution: measured-618, num: 100}`, see [drawn fabrics](#drawn-fabrics). A job has
+at most 1,000,000 samples.
 """
 
 AXIS_HEAD = ("| axis | values | meaning |", "|---|---|---|")
@@ -79,22 +82,35 @@ def reference() -> str:
         known = {**every, **(every_cloth if name in cloth else {})}
         lines += _table(AXIS_HEAD, _without(axes[name], cloth_axes if name in cloth else {}))
         lines += _table(KEY_HEAD, _without(keys[name], known))
-    for key, what, model in CUSTOM:
+    for key, entry_name, model in CUSTOM:
         meaning = " ".join((model.__doc__ or "").split("\n\n", 1)[-1].split())
         schema = model.model_json_schema()
         rows = {
             name: _field_row(name, field, schema) for name, field in schema["properties"].items()
         }
-        lines += [f"## Custom {what}s\n", f"Entries of `{key}`. {meaning}\n"]
+        lines += [f"## Custom {entry_name}s\n", f"Entries of `{key}`. {meaning}\n"]
         lines += _table(KEY_HEAD, rows)
-    return "\n".join(lines)
+    return "\n".join(lines + _drawn_fabrics())
+
+
+def _drawn_fabrics() -> list[str]:
+    """Return the section of axes that draw fabrics."""
+    lines = ["## Drawn fabrics\n"]
+    for model in (FabricDistribution, FabricRanges):
+        schema = model.model_json_schema()
+        fields = schema["properties"].items()
+        rows = {name: _field_row(name, field, schema) for name, field in fields}
+        lines += [f"{' '.join((model.__doc__ or '').split())}\n", *_table(KEY_HEAD, rows)]
+    return lines
 
 
 def _shared(tables: Iterable[Rows]) -> Rows:
     """Return the rows that all tables have, in the order of the first table."""
-    first, *others = tables
+    first, *further_tables = tables
     return {
-        name: row for name, row in first.items() if all(table.get(name) == row for table in others)
+        name: row
+        for name, row in first.items()
+        if all(table.get(name) == row for table in further_tables)
     }
 
 

@@ -18,7 +18,7 @@ from stickslip_training.cloth.clips import clips_of_file
 from stickslip_training.cloth.model import WEIGHTS, load_friction
 from stickslip_training.cloth.posterior import estimates
 
-SHOWN = 3  # of the six instants that a clip has
+INSTANT = 3  # of the six instants that a clip has
 LATE = [1, 2, 3, 4, 5, 0]  # the order of its instants in the last clip
 
 
@@ -39,26 +39,27 @@ def main() -> None:
         clips, about = clips_of_file(path, model.materials)
         with np.load(path) as file:
             videos = file["video"]
-        one = next(
+        clip_number = next(
             clip
             for clip in random.permutation(len(about))
             if about[clip]["material"] not in fabrics
         )
-        fabrics.add(about[one]["material"])
-        read = clips[np.array([one])]
+        fabrics.add(about[clip_number]["material"])
+        read = clips[np.array([clip_number])]
         if late := place == len(args.clips) - 1:
             read.crops[:] = read.crops[:, LATE]
-        found = estimates(model.estimate(read).mu, model.bins)
+        estimate = estimates(model.estimate(read).mu, model.bins)
         reason = model.judge(read)[1][0]
         answer = (
-            f"{found.median[0]:.2f} ({found.low[0]:.2f} to {found.high[0]:.2f})"
+            f"{estimate.median[0]:.2f} ({estimate.low[0]:.2f} to {estimate.high[0]:.2f})"
             if reason is None
             else "no answer"
         )
         axes = figure.add_subplot(2, columns, place + 1)
-        axes.imshow(videos[one][LATE[SHOWN] if late else SHOWN])
+        axes.imshow(videos[clip_number][LATE[INSTANT] if late else INSTANT])
         axes.set_title(
-            f"true friction {about[one]['mu']:.2f}\n{answer}{f': {reason}' if reason else ''}",
+            f"true friction {about[clip_number]['mu']:.2f}\n"
+            f"{answer}{f': {reason}' if reason else ''}",
             fontsize=11,
         )
         axes.set_axis_off()

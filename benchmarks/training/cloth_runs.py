@@ -34,7 +34,7 @@ from stickslip_sim_core import fabric as fabric_named  # noqa: E402
 from stickslip_sim_core.scenes import cloth_drag  # noqa: E402
 from stickslip_training.cloth.runs import STEP, grid_order  # noqa: E402
 
-SHOWN = 30  # frames of a clip
+CLIP_FRAMES = 30  # frames of a clip
 FRAMES = 300  # of a simulation
 MU = 1.6
 DROPPED = 17  # the first instant after the drop
@@ -63,19 +63,19 @@ def points(
         1 + len(varied), seed=np.random.default_rng((seed, fabric_names().index(fabric)))
     )
     count = 1 << (runs - 1).bit_length()
-    found = []
+    points = []
     for mu, *shares in engine.random(count)[:runs].tolist():
         factors = {name: ranges[name][0] for name in FACTORS}
         for name, share in zip(varied, shares, strict=True):
             low, high = ranges[name]
             factors[name] = round(low * (high / low) ** share, 6)
-        found.append(Point(round(MU * mu, 6), factors))
-    return found
+        points.append(Point(round(MU * mu, 6), factors))
+    return points
 
 
 def instants_of(frames: int) -> list[int]:
     """Return the simulated instants that clips show."""
-    return [instant for instant in shown_frames(SHOWN, FRAMES) if instant < frames]
+    return [instant for instant in shown_frames(CLIP_FRAMES, FRAMES) if instant < frames]
 
 
 def simulate(
@@ -123,11 +123,11 @@ def simulate(
         "cpu_s": round(time.process_time() - started, 2),
     }
     instants = instants_of(frames)
-    shown = (
+    positions = (
         scene.positions[instants] if scene.valid else np.zeros((len(instants), len(scene.rest), 3))
     )
     return {
-        "positions": np.round(shown / STEP).astype(np.int16),
+        "positions": np.round(positions / STEP).astype(np.int16),
         "rest": scene.rest.astype(np.float32),
         "triangles": scene.triangles.astype(np.int16),
         "instants": np.array(instants, np.int16),

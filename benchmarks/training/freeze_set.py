@@ -28,10 +28,10 @@ def main() -> None:
     split: Split | None = None if args.all else "test"
     folder = Path(stickslip_training.benchmark.__path__[0]) / "sets"
     with DatasetReader(args.dataset) as reader:
-        document, seen = frozen(
+        document, control_values = frozen(
             args.name, args.about, yaml.safe_load(args.spec.read_text()), split, reader
         )
-    for suffix, data in ((".json", document), (".npz", seen)):
+    for suffix, data in ((".json", document), (".npz", control_values)):
         (folder / f"{args.name}{suffix}").write_bytes(data)
         print(f"{folder / args.name}{suffix}: {len(data) / 1e3:.1f} kB")
 

@@ -83,12 +83,12 @@ class Process:
             weights,
         )
 
-    def predict(self, seen: Array) -> Estimates:
+    def predict(self, features: Array) -> Estimates:
         """Return mu at `seen` (clips, n), and the central interval of the probability `SHARE`.
 
         All are within the known range of mu.
         """
-        kernel = np.exp(-0.5 * cdist(seen, self.known, "sqeuclidean") / self.length**2)
+        kernel = np.exp(-0.5 * cdist(features, self.known, "sqeuclidean") / self.length**2)
         left = 1 + self.noise**2 - np.einsum("ij,ji->i", kernel, cho_solve(self.factor, kernel.T))
         half = norm.ppf(0.5 + SHARE / 2) * self.amplitude * np.sqrt(np.maximum(left, 0.0))
         median = self.mean + kernel @ self.weights
@@ -140,21 +140,26 @@ def main() -> None:
         f"{time.process_time() - started:.0f} CPU s, length {fitted.length:.3g}, noise "
         f"{fitted.noise:.3g}"
     )
-    shown = {path.stem: clips_of_file(path, model.materials)[0] for path in args.clips}
-    shown["all files"] = Clips.joined(list(shown.values()))
-    if set(shown["all files"].mu.tolist()) & set(train.mu.tolist()):
+    clips_by_name = {path.stem: clips_of_file(path, model.materials)[0] for path in args.clips}
+    clips_by_name["all files"] = Clips.joined(list(clips_by_name.values()))
+    if set(clips_by_name["all files"].mu.tolist()) & set(train.mu.tolist()):
         raise ValueError(
             f"{', '.join(map(str, args.clips))} must show no simulation of {args.runs}"
         )
-    for name, clips in shown.items():
-        told = errors(reader.read(clips), clips.mu, clips.run)
+    for name, clips in clips_by_name.items():
+        scores = errors(reader.read(clips), clips.mu, clips.run)
         parts = {
-            key: round(getattr(told, key).value, 3)
+            key: round(getattr(scores, key).value, 3)
             for key in ("mae", "within_01", "within_02", "coverage")
         }
         print(
             json.dumps(
-                {"clips of": name, "clips": told.clips, "simulations": told.simulations, **parts}
+                {
+                    "clips of": name,
+                    "clips": scores.clips,
+                    "simulations": scores.simulations,
+                    **parts,
+                }
             ),
             flush=True,
         )

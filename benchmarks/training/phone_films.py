@@ -83,48 +83,57 @@ def answers(video: Any, true: dict[str, Any], number: int, model: FrictionModel)
     frames = video[: -len(INSTANTS)]
     clip = video[-len(INSTANTS) :]
     shake = np.random.default_rng(number).normal(0.0, SHAKE, (len(frames), 2)).cumsum(axis=0)
-    told = {name: true[name] for name in ("viewpoint", "texture", "material", "mu")}
+    answers_of_film = {name: true[name] for name in ("viewpoint", "texture", "material", "mu")}
     imported = None
 
     def answer(clips: Clips) -> list[float] | str:
-        found = predictions(model.estimate(clips), [0], model.judge(clips))[0]
-        return found["no_answer"] or [found["mu"][name] for name in ("median", "low", "high")]
+        prediction = predictions(model.estimate(clips), [0], model.judge(clips))[0]
+        return prediction["no_answer"] or [
+            prediction["mu"][name] for name in ("median", "low", "high")
+        ]
 
     for name, (first, last) in VARIANTS.items():
-        some = slice(first, len(frames) - last)
+        frame_range = slice(first, len(frames) - last)
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "film.mp4"
-            moved = shake[some] - shake[first]
+            moved = shake[frame_range] - shake[first]
             write_film(
-                path, frames[some], camera, rate=FRAMES_A_SECOND, distortion=DISTORTION, shake=moved
+                path,
+                frames[frame_range],
+                camera,
+                rate=FRAMES_A_SECOND,
+                distortion=DISTORTION,
+                shake=moved,
             )
             try:
                 imported = import_video(path, lens)[0]
             except ValueError as error:
-                told[name] = f"refused: {error}"
+                answers_of_film[name] = f"refused: {error}"
             else:
-                told[name] = answer(imported)
+                answers_of_film[name] = answer(imported)
     if imported is not None:
-        seen = Cameras.of([camera])
-        crops = cut(grey(torch.from_numpy(clip[None])), holder_crops(seen, INSTANTS))
-        told[CLIP] = answer(replace(imported, crops=crops, direction=seen.rotation[:, 2]))
-    return told
+        cameras = Cameras.of([camera])
+        crops = cut(grey(torch.from_numpy(clip[None])), holder_crops(cameras, INSTANTS))
+        answers_of_film[CLIP] = answer(
+            replace(imported, crops=crops, direction=cameras.rotation[:, 2])
+        )
+    return answers_of_film
 
 
-def summary(told: list[dict[str, Any]], name: str) -> dict[str, Any]:
+def summary(films: list[dict[str, Any]], name: str) -> dict[str, Any]:
     """Return the errors of the answers to the films, to a variant of them or to the clips."""
-    said = [film.get(name, "refused: as the film") for film in told]
-    read = [place for place, each in enumerate(said) if not isinstance(each, str)]
-    refused = sum(isinstance(each, str) and each.startswith("refused") for each in said)
+    answers_to_films = [film.get(name, "refused: as the film") for film in films]
+    read = [place for place, each in enumerate(answers_to_films) if not isinstance(each, str)]
+    refused = sum(isinstance(each, str) and each.startswith("refused") for each in answers_to_films)
     row: dict[str, Any] = {
         "clips of": name,
         "refused": refused,
-        "no_answer": len(said) - len(read) - refused,
+        "no_answer": len(answers_to_films) - len(read) - refused,
     }
     if read:
-        mu = np.array([told[place]["mu"] for place in read])
+        mu = np.array([films[place]["mu"] for place in read])
         scores = errors(
-            Estimates(*np.array([said[place] for place in read]).T),
+            Estimates(*np.array([answers_to_films[place] for place in read]).T),
             mu,
             np.unique(mu, return_inverse=True)[1],
         )
@@ -132,7 +141,7 @@ def summary(told: list[dict[str, Any]], name: str) -> dict[str, Any]:
         row |= {
             each: round(getattr(scores, each).value, 3) for each in ("mae", "within_01", "coverage")
         }
-        whole = [(said[place][0], told[place]["whole"]) for place in read]
+        whole = [(answers_to_films[place][0], films[place]["whole"]) for place in read]
         off = [abs(median - film[0]) for median, film in whole if not isinstance(film, str)]
         row["from_whole"] = {"mean": round(float(np.mean(off)), 4), "largest": round(max(off), 4)}
     return row
@@ -140,18 +149,18 @@ def summary(told: list[dict[str, Any]], name: str) -> dict[str, Any]:
 
 def measure(films: list[Path], model: FrictionModel, record: Path | None) -> None:
     """Print the errors of films, of their variants and of clips."""
-    told: list[dict[str, Any]] = []
+    answered: list[dict[str, Any]] = []
     for path in films:
         with np.load(path) as file:
             videos = file["video"]
             about = [json.loads(str(line)) for line in file["about"]]
         for video, true in zip(videos, about, strict=True):
-            told.append({"floor": path.stem} | answers(video, true, len(told), model))
-            print(json.dumps(told[-1]), flush=True)
-    rows = [summary(told, name) for name in [*VARIANTS, CLIP]]
+            answered.append({"floor": path.stem} | answers(video, true, len(answered), model))
+            print(json.dumps(answered[-1]), flush=True)
+    rows = [summary(answered, name) for name in [*VARIANTS, CLIP]]
     print(json.dumps(rows, indent=1))
     if record is not None:
-        write_durably(record, (json.dumps({"rows": rows + told}, indent=1) + "\n").encode())
+        write_durably(record, (json.dumps({"rows": rows + answered}, indent=1) + "\n").encode())
 
 
 def main() -> None:

@@ -52,16 +52,18 @@ def rod_by_rod(fit: Callable[[Any], Any]) -> Callable[[Lines], list[Answer]]:
     """
 
     def answers(lines: Lines) -> list[Answer]:
-        found: list[Answer] = []
+        answers: list[Answer] = []
         for line in lines.astype(np.float64):
             try:
                 fitted = fit(line)
             except RuntimeError:
-                found.append({"bending": None})
+                answers.append({"bending": None})
                 continue
             curvature = bending(fitted.solution.curvature[0])
-            found.append({"bending": np.round(curvature, 5).tolist(), "gamma": float(fitted.gamma)})
-        return found
+            answers.append(
+                {"bending": np.round(curvature, 5).tolist(), "gamma": float(fitted.gamma)}
+            )
+        return answers
 
     return answers
 
@@ -92,8 +94,8 @@ def main() -> None:
         started = time.process_time()
         answers = [
             {"slot": slot, "noise": noise, **answer}
-            for noise, seen in zip(noises, lines, strict=True)
-            for slot, answer in zip(slots, method(seen), strict=True)
+            for noise, noisy_lines in zip(noises, lines, strict=True)
+            for slot, answer in zip(slots, method(noisy_lines), strict=True)
         ]
         (args.out / f"{name}.json").write_text(json.dumps(answers) + "\n")
         print(

@@ -181,9 +181,9 @@ def filmed(path: Path, materials: tuple[str, ...], steps: tuple[Callable[..., An
     with np.load(path) as file:
         videos = file["video"]
     crops = []
-    for place, (video, told) in enumerate(zip(videos, about, strict=True)):
+    for place, (video, about_clip) in enumerate(zip(videos, about, strict=True)):
         random = np.random.default_rng((SEED, place))
-        camera = named[told["viewpoint"]]
+        camera = named[about_clip["viewpoint"]]
         holds = (clamp, hands)[random.integers(2)]
         for step in steps:
             if len(steps) == 1 or step not in (clamp, hands) or step is holds:
@@ -200,7 +200,7 @@ def without_answer(runs: Runs) -> dict[str, Clips]:
     runs = replace(runs, positions=runs.positions[:, frames], instants=INSTANTS)
     held = holders_at(INSTANTS)
 
-    def shown(positions: Any, seed: int) -> Clips:
+    def render_worlds(positions: Any, seed: int) -> Clips:
         return render_clips(
             replace(runs, positions=positions.astype(np.float32)),
             2,
@@ -218,22 +218,22 @@ def without_answer(runs: Runs) -> dict[str, Clips]:
     stiff[..., 0] += held[..., 2] - stiff[..., 2]
     stiff[..., 2] = held[..., 2]
     empty = meshes + np.array([0, 0, -9.0], np.float32)
-    good = shown(meshes, 0)
+    good = render_worlds(meshes, 0)
     lies = (meshes[:, 2:3, ..., 2:] < 0.004) & (np.arange(6) >= 2)[None, :, None, None, None]
     stuck = np.where(lies, meshes[:, 2:3], meshes)
     noise = torch.rand(good.crops.shape, generator=torch.Generator().manual_seed(SEED))
     return {
-        "hangs free, 6 cm higher": shown(lifted, 1),
-        "hangs free, and leans": shown(swung, 2),
-        "a board that lies in the air": shown(stiff, 3),
-        "moves as one piece": shown(rigid, 4),
-        "half as wide": shown(narrow, 5),
-        "of two thirds the size": shown(sized(meshes, held, 0.67), 6),
-        "of half again the size": shown(sized(meshes, held, 1.5), 7),
-        "glued from the second leg on": shown(stuck, 8),
-        "glued all along": shown(glued(meshes, held), 9),
-        "half a leg out of phase": shown(reordered(meshes, held, [1, 2, 3, 4, 5, 0]), 10),
-        "no cloth": shown(empty, 11),
+        "hangs free, 6 cm higher": render_worlds(lifted, 1),
+        "hangs free, and leans": render_worlds(swung, 2),
+        "a board that lies in the air": render_worlds(stiff, 3),
+        "moves as one piece": render_worlds(rigid, 4),
+        "half as wide": render_worlds(narrow, 5),
+        "of two thirds the size": render_worlds(sized(meshes, held, 0.67), 6),
+        "of half again the size": render_worlds(sized(meshes, held, 1.5), 7),
+        "glued from the second leg on": render_worlds(stuck, 8),
+        "glued all along": render_worlds(glued(meshes, held), 9),
+        "half a leg out of phase": render_worlds(reordered(meshes, held, [1, 2, 3, 4, 5, 0]), 10),
+        "no cloth": render_worlds(empty, 11),
         "upside down": replace(good, crops=good.crops.flip(2)),
         "a crop that is off by 6 and 8 px": replace(
             good, crops=torch.roll(good.crops, (6, 8), (2, 3))
@@ -262,13 +262,13 @@ def main() -> None:
             (f" / {path.stem}", filmed(path, model.materials, FACTORS[name])) for path in args.clips
         ]
         for floor, clips in [("", Clips.joined([clips for _, clips in films])), *films]:
-            found = estimates(model.estimate(clips).mu, model.bins)
-            told = errors(found, clips.mu, clips.run)
+            estimate = estimates(model.estimate(clips).mu, model.bins)
+            scores = errors(estimate, clips.mu, clips.run)
             refused = sum(reason is not None for reason in model.judge(clips)[1])
             rows[name + floor] = {
-                "clips": told.clips,
-                "simulations": told.simulations,
-                **{each: round(getattr(told, each).value, 3) for each in COLUMNS},
+                "clips": scores.clips,
+                "simulations": scores.simulations,
+                **{each: round(getattr(scores, each).value, 3) for each in COLUMNS},
                 "no_answer": round(refused / len(clips), 3),
             }
             print(name + floor, rows[name + floor], flush=True)

@@ -167,17 +167,17 @@ class TestTheRule:
         submit_job(context, cloth(allow_uncertified=True), None)
         weaver.work()
         added = register_certificate(context.database, context.store, upload(), context.clock())
-        before = len(weaver.ran)
+        before = len(weaver.finished_ids)
         job = submit_job(context, cloth(allow_uncertified=True), None)
         weaver.work()
-        assert [name.partition("-")[0] for name in weaver.ran[before:]] == ["publish"]
+        assert [name.partition("-")[0] for name in weaver.finished_ids[before:]] == ["publish"]
         manifest = manifest_of(context, job)
         assert (manifest.version, manifest.certificate) == (2, added.digest)
         # And the strict spec shares every sample with the lenient one.
-        before = len(weaver.ran)
+        before = len(weaver.finished_ids)
         submit_job(context, cloth(), None)
         weaver.work()
-        assert {name.partition("-")[0] for name in weaver.ran[before:]} == {"publish"}
+        assert {name.partition("-")[0] for name in weaver.finished_ids[before:]} == {"publish"}
 
     def test_rods_need_none_and_carry_what_there_is(
         self, context: Context, worker: PretendWorker

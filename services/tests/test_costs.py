@@ -188,7 +188,7 @@ def test_a_task_that_ends_its_process_each_time_is_quarantined(
     assert (
         worker.work() == 3 + 3 + 1
     )  # everything else: simulations, renders, and the shard that needs no poison
-    assert poison not in worker.ran
+    assert poison not in worker.finished_ids
     sweep(context)
     job = show_job(context, job_id)
     assert (job.state, job.reason) == (JobState.failed, Reason.quarantined)

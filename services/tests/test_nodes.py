@@ -50,7 +50,7 @@ def settings(
     if request.param == "sqlite":
         return Settings.chosen(data=tmp_path / "a", durable=False)
     bucket = request.getfixturevalue("bucket")
-    request.getfixturevalue("s3").some(1, FAULTS)
+    request.getfixturevalue("s3").inject_faults(1, FAULTS)
     monkeypatch.setenv("STICKSLIP_DATABASE", request.getfixturevalue("postgresql").clean())
     return Settings.chosen(data=tmp_path / "a", store=bucket, durable=False)
 

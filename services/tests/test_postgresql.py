@@ -147,9 +147,9 @@ def test_two_coordinators_share_the_work(pair: Pair) -> None:
         count = connection.scalar(select(func.count()).select_from(tasks))
         attempts = set(connection.scalars(select(tasks.c.attempts)))
     database.close()
-    ran = Counter(name for worker in workers for name in worker.ran) - lost
+    ran = Counter(name for worker in workers for name in worker.finished_ids) - lost
     assert (len(ran), set(ran.values()), attempts) == (count, {1}, {1})
-    assert sum(bool(worker.ran) for worker in workers) > 1
+    assert sum(bool(worker.finished_ids) for worker in workers) > 1
     for server in pair.servers:
         listed = pair.client.get(f"{server.url}/v1/jobs").json()["items"]
         assert {job["id"] for job in listed} == set(jobs)

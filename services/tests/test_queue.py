@@ -160,7 +160,7 @@ def test_a_rejected_simulation_rejects_its_renders(context: Context, worker: Pre
         (0, Reason.solver_diverged, "it diverged"),
         (1, Reason.solver_diverged, "it diverged"),
     ]
-    assert len([name for name in worker.ran if name.startswith("render")]) == 2
+    assert len([name for name in worker.finished_ids if name.startswith("render")]) == 2
     check(context)
 
 
@@ -206,12 +206,14 @@ def test_the_same_grid_again_runs_nothing(context: Context, worker: PretendWorke
 def test_a_bigger_grid_runs_what_is_new(context: Context, worker: PretendWorker) -> None:
     submit(context)
     worker.work()
-    ran = len(worker.ran)
+    ran = len(worker.finished_ids)
     bigger = submit(context, gamma=(1.0, 2.0, 5.0))
     worker.work()
     job = show_job(context, bigger)
     assert job.state is JobState.succeeded
-    assert len(worker.ran) - ran == 2 + 2 + 1 + 1  # two shards are those of the smaller grid
+    assert (
+        len(worker.finished_ids) - ran == 2 + 2 + 1 + 1
+    )  # two shards are those of the smaller grid
     assert job.progress.stages[Stage.simulate].cached == 4
     assert job.progress.stages[Stage.simulate].cpu_seconds == 4.0
     check(context)
@@ -533,7 +535,7 @@ def test_one_simulation_serves_all_looks_and_those_that_come_later(context: Cont
     assert first == {Stage.simulate: {"all": 1, "cached": 0}, Stage.render: {"all": 4, "cached": 0}}
     more = work(texture=["dots", "plaid", "floral"], viewpoint=["left", "right"])
     assert more == {Stage.simulate: {"all": 1, "cached": 1}, Stage.render: {"all": 6, "cached": 4}}
-    assert sum(name.startswith("simulate") for name in worker.ran) == 1
+    assert sum(name.startswith("simulate") for name in worker.finished_ids) == 1
     check(context)
 
 
@@ -720,7 +722,7 @@ class TestPausing:
         assert resume_job(context, job).state is JobState.running
         worker.work()
         assert show_job(context, job).state is JobState.succeeded
-        assert len(worker.ran) == len(set(worker.ran)) == 11
+        assert len(worker.finished_ids) == len(set(worker.finished_ids)) == 11
         check(context)
 
     def test_it_survives_a_restart(self, settings: Settings, clock: ManualClock) -> None:

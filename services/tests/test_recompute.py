@@ -100,12 +100,12 @@ def test_only_what_is_damaged_is_made_again(
     directory(worker).path(PackOutput.model_validate_json(str(output)).files[0].sha256).write_bytes(
         b"x"
     )
-    worker.ran.clear()
+    worker.finished_ids.clear()
     job = submit(context)
     sweep(context)
     assert "1 of its files were damaged or lost" in show_job(context, job).message
     finish(context, worker, clock, job)
-    assert [name.partition("-")[0] for name in worker.ran] == ["pack", "publish"]
+    assert [name.partition("-")[0] for name in worker.finished_ids] == ["pack", "publish"]
 
 
 def test_a_rotten_trajectory_is_simulated_again(

@@ -164,10 +164,10 @@ def test_a_section_that_is_damaged_in_the_store_is_made_again(
         sweep(context)
         shown = client.job(job.id)
         assert "its manifest was damaged or lost" in shown.message
-        worker.ran.clear()
+        worker.finished_ids.clear()
         worker.work()
         assert client.job(job.id).state is JobState.succeeded_with_rejects
-        assert [name.partition("-")[0] for name in worker.ran] == ["publish"]
+        assert [name.partition("-")[0] for name in worker.finished_ids] == ["publish"]
         assert context.store.holds(entry.sha256)
     with context.database.read() as connection:
         assert violations(connection) == []

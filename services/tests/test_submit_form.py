@@ -2,6 +2,7 @@
 
 import html
 import re
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
 
@@ -9,7 +10,9 @@ import httpx
 import pytest
 import yaml
 from stickslip_schemas.kinds import KINDS, job_spec_adapter
-from stickslip_schemas.scene.library import scene_names
+from stickslip_schemas.scene.library import load_scene, scene_names
+from stickslip_services.pages.rendering import spec_text
+from stickslip_services.pages.submit_filling import filled_form
 from stickslip_services.pages.submit_form import FormError, document_of, field_of, form_of, grouped
 from stickslip_testing.servers import RunningServer
 
@@ -51,11 +54,27 @@ def test_a_form_gives_the_spec_that_it_shows() -> None:
     assert job_spec_adapter.validate_python(document).sample_count == 10
 
 
+def test_fabrics_are_drawn_where_a_number_of_them_is_given() -> None:
+    fields = [
+        ("axes.material.values", "gray-interlock"),
+        ("axes.material.num", "5"),
+        ("axes.mu.values", "0.3"),
+        ("axes.texture.values", "dots"),
+        ("axes.viewpoint.values", "left"),
+        ("store_positions", "yes"),
+    ]
+    document = document_of(form_of("cloth_drag", None), grouped(fields))
+    assert document["axes"]["material"] == {"distribution": "measured-618", "num": 5}
+    assert job_spec_adapter.validate_python(document).sample_count == 5
+    belt = document_of(form_of("cloth_scene", "belt"), grouped([*BELT, ("axes.fabric.num", "3")]))
+    assert job_spec_adapter.validate_python(belt).sample_count == 30
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_key_of_every_kind_has_a_field_or_is_named(kind: str) -> None:
     form = form_of(kind, None)
     schema = KINDS[kind].model_json_schema()
-    known = {setting.name for setting in form.settings} | set(form.others)
+    known = {setting.name for setting in form.settings} | set(form.yaml_keys)
     assert known | {"kind", "name", "scene", "set", "axes"} >= set(schema["properties"])
     axes = schema["$defs"][schema["properties"]["axes"]["$ref"].rpartition("/")[2]]
     assert {axis.name for axis in form.axes} >= set(axes["properties"])
@@ -98,6 +117,55 @@ def test_values_are_read_as_they_are_written() -> None:
     for wrong in ("a: [", "just a word", "- 1", "x: !!binary aGk=", "x: !!set {a}", "1: 2"):
         with pytest.raises(FormError, match=r"more: (is not YAML|must be keys|must have values)"):
             document_of(form, sent(more=wrong))
+
+
+EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.yaml"))
+
+
+def own_scene() -> dict[str, Any]:
+    """Return a spec with a scene that is not built in."""
+    scene = load_scene("peg").model_dump(mode="json", exclude_unset=True) | {"name": "mine"}
+    axes = {"mu": [0.2, 0.4], "texture": "dots", "viewpoint": "front"}
+    return {"kind": "cloth_scene", "scene": scene, "axes": axes, "frames": 8}
+
+
+def built_in_scene(name: str) -> dict[str, Any]:
+    axes = {"texture": ["checker", "dots"], "viewpoint": "front", "lighting": "room"}
+    return {"kind": "cloth_scene", "scene": name, "axes": axes, "measured": 0.5}
+
+
+SPECS = {
+    **{path.stem: yaml.safe_load(path.read_text()) for path in EXAMPLES},
+    **{name: built_in_scene(name) for name in scene_names()},
+    "own scene": own_scene(),
+}
+
+
+@pytest.mark.parametrize("document", SPECS.values(), ids=SPECS)
+def test_a_form_that_a_job_filled_in_gives_its_spec_again(document: dict[str, Any]) -> None:
+    """So does its YAML, and a change of one field changes that field alone."""
+    spec = job_spec_adapter.validate_python(document)
+    form, filling = filled_form(spec)
+    again = job_spec_adapter.validate_python(document_of(form, filling.fields))
+    assert again.model_dump(mode="json") == spec.model_dump(mode="json")
+    shown = job_spec_adapter.validate_python(yaml.safe_load(spec_text(spec)))
+    assert shown.content_digest == spec.content_digest
+
+    changed = document_of(form, {**filling.fields, "seed": ["77"]})
+    expected = spec.model_dump(mode="json") | {"seed": 77}
+    assert job_spec_adapter.validate_python(changed).model_dump(mode="json") == expected
+
+
+def test_the_page_of_a_job_leads_to_its_form(server: RunningServer) -> None:
+    document = built_in_scene("belt") | {"name": "ten-belts", "allow_uncertified": True}
+    server.worker(kinds=("cloth_scene",))
+    job = httpx.post(f"{server.url}/v1/jobs", json=document).json()["id"]
+    assert f'href="/submit?job={job}"' in httpx.get(f"{server.url}/jobs/{job}").text
+    page = httpx.get(f"{server.url}/submit?job={job}").text
+    assert 'name="name" value="ten-belts"' in page
+    ticked = re.findall(r'name="axes.texture.values" value="(\w+)" checked', page)
+    assert ticked == ["checker", "dots"]
+    assert httpx.get(f"{server.url}/submit?job=job-0000000000000000").status_code == 404
 
 
 def test_faults_find_their_fields() -> None:

@@ -50,7 +50,7 @@ def test_a_quarantined_task_of_an_open_job_runs_again(
 ) -> None:
     job = submit(context)
     crash(worker, clock, context, attempts=2)
-    task = worker.ran[0]
+    task = worker.finished_ids[0]
     # Paused, so that the job is still open when its only simulation is quarantined.
     leases = worker.lease(simulate=1)
     worker.start(*leases)

@@ -80,6 +80,7 @@ def test_commands_are_listed_in_sections() -> None:
         "Jobs:",
         "Datasets:",
         "Scenes:",
+        "Fabrics:",
         "Certificates:",
         "Administration:",
         "Maintenance:",

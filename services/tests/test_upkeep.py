@@ -138,7 +138,7 @@ def test_a_removed_dataset_is_made_again(settings: Settings, made: list[str]) ->
     job = submitted(context, (1.0, 2.0))
     worker.work()
     assert show_job(context, job.id).state == JobState.succeeded
-    simulated = [task for task in worker.ran if task.startswith("simulate")]
+    simulated = [task for task in worker.finished_ids if task.startswith("simulate")]
     assert len(simulated) == 2  # the two that the other dataset does not share
     assert manifest.read_bytes() == content
     with context.database.read() as connection:

@@ -65,4 +65,4 @@ def test_a_submission_enters_few_files_and_none_twice(
     walk = {name: files for name, files in entered_from.items() if name not in INFRASTRUCTURE}
     assert len(walk) <= MAX_FILES, sorted(walk)
     assert {name: files for name, files in walk.items() if len(files) > 1} == {}
-    assert worker.ran == []
+    assert worker.finished_ids == []

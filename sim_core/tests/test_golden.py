@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from stickslip_testing.constants import SCENES
+from stickslip_testing.contact_scenes import SCENES
 
 from stickslip_sim_core import (
     Cloth,

@@ -4,6 +4,7 @@ colour seed.
 
 import errno
 import os
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,7 @@ class RenderActor:
         if what == BUG:
             raise RuntimeError("a bug")
         if what >= UNTIL_RELEASED:
+            print(f"waits for release-{what}", file=sys.stderr, flush=True)
             (self._beside / f"pid-{what}").write_text(str(os.getpid()))
             while not (self._beside / f"release-{what}").exists():
                 time.sleep(0.01)

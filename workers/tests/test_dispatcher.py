@@ -186,6 +186,10 @@ def test_a_render_process_that_is_killed_costs_one_try(
     os.kill(pid, signal.SIGKILL)
     double.until(lambda: "crash" in double.results)
     assert double.results["crash"].reason is Reason.renderer_crash
+    # A killed process cannot say anything, so the message has the end of its log.
+    assert double.results["crash"].message.endswith(
+        f"The end of its log:\nwaits for release-{HANG}"
+    )
     (store.root / f"release-{HANG}").touch()
     (store.root / f"release-{HANG + 1}").touch()
     double.offer(again=_render(HANG))
@@ -209,8 +213,9 @@ def test_short_renders_share_a_call_and_only_what_fails_by_itself_fails(
     os.kill(together, signal.SIGKILL)
     alone = _wait_for_pid(double, store, HANG)
     assert alone != together
-    os.kill(alone, signal.SIGKILL)
+    os.kill(alone, signal.SIGSEGV)
     double.until(lambda: len(double.results) == 6)
+    assert "Segmentation fault" in double.results["crash"].message
     assert {
         name: result.reason for name, result in double.results.items() if result.outcome == "failed"
     } == {

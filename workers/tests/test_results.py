@@ -4,6 +4,7 @@ Renders of one shading are merged, and their result is split.
 """
 
 import errno
+from pathlib import Path
 
 import pytest
 from ray import exceptions as ray_errors
@@ -21,6 +22,7 @@ from stickslip_schemas.kinds.rod_hang import RodHangRender
 from stickslip_schemas.store import CorruptArtifactError
 from stickslip_workers.batching import merge_renders, shading_key, split_render_result
 from stickslip_workers.dispatcher import process_failure
+from stickslip_workers.process_log import TAIL_LINES, ProcessLog
 from stickslip_workers.stages.run import MESSAGE_LENGTH, failure
 
 RECORD = RecordRef(digest="d" * 64, row=0)
@@ -68,6 +70,29 @@ def test_what_a_stage_raises(error: Exception, reason: Reason) -> None:
 )
 def test_what_ray_raises(error: Exception, renders: bool, reason: Reason) -> None:
     assert process_failure(error, renders=renders).reason is reason
+
+
+def test_a_message_has_what_a_dead_process_wrote_for_this_call(tmp_path: Path) -> None:
+    path = tmp_path / "worker.err"
+    path.write_text("of the call before\n")
+    log = ProcessLog(str(path), path.stat().st_size)
+    died = ray_errors.WorkerCrashedError()
+    assert process_failure(died, renders=False, log=log).message == str(died)
+    with path.open("a") as file:
+        file.writelines(f"line {number}\n" for number in range(500))
+        file.write("\n\nFatal Python error\n")
+    message = process_failure(died, renders=False, log=log).message
+    assert message.startswith(str(died)[:100])
+    lines = message.partition("The end of its log:\n")[2].splitlines()
+    assert lines[-2:] == ["line 499", "Fatal Python error"]
+    assert len(lines) == TAIL_LINES
+    assert "of the call before" not in message
+    with path.open("a") as file:
+        file.write("x" * 10**6)
+    assert len(process_failure(died, renders=False, log=log).message) < MESSAGE_LENGTH
+    # The process of another machine has no file here.
+    elsewhere = ProcessLog(str(tmp_path / "elsewhere.err"), 0)
+    assert process_failure(died, renders=False, log=elsewhere).message == str(died)
 
 
 def done(number: int) -> TaskResult:

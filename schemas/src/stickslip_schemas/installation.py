@@ -8,6 +8,7 @@ FOLDERS = {
     "stickslip-schemas": ("./schemas",),
     "stickslip": ("./schemas", "./services"),
     "stickslip-training": ("./schemas", "./training"),
+    "stickslip-measure": ("./sim_core", "./measure"),
     "stickslip-blender": ("./schemas", "./workers/blender"),
 }
 """The folders of a clone that pip needs for each distribution; the last is the distribution's."""

@@ -116,7 +116,7 @@ def test_sizes_of_faces_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_vertices_are_welded_in_their_order() -> None:
     same = weld(np.array([[1.0, 2.0], [0.0, 0.0], [1.0, 2.0], [-0.0, 0.0], [3.0, 1.0]]))
-    assert same.kept.tolist() == [0, 1, 4]
+    assert same.vertices.tolist() == [0, 1, 4]
     assert same.targets.tolist() == [0, 1, 0, 1, 2]
     apart = weld(np.array([[1.0], [0.0], [np.nextafter(1.0, 2.0)]]))
-    assert apart.kept.tolist() == [0, 1, 2]
+    assert apart.vertices.tolist() == [0, 1, 2]

@@ -12,6 +12,7 @@ from stickslip_schemas.kinds import AnyJobSpec, job_spec_adapter
 from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.plan.costs import count, estimate_cost
 from stickslip_schemas.plan.points import keyed_points
+from stickslip_schemas.scene.library import load_scene
 from stickslip_schemas.spec.cameras import framed, load_rig
 from stickslip_schemas.spec.names import Calibration
 from stickslip_schemas.spec.resolution import CLIP_PIXELS_MAX
@@ -194,6 +195,46 @@ def test_pictures_of_several_sizes_share_frames_of_the_largest() -> None:
     left, lab = (spec.render(point) for point in spec.grid())
     assert (left.picture_size, lab.picture_size) == ((128, 128), (320, 96))
     assert left.canvas == lab.canvas == (320, 128)
+
+
+def _with_cameras(**more: Any) -> dict[str, Any]:
+    """Return a spec of a scene with two cameras of its own; the second one has more keys."""
+    scene = load_scene("peg").model_dump(mode="json", exclude_unset=True)
+    near: dict[str, Any] = {"position": [0.3, -0.6, 0.9], "target": [0.0, 0.0, 0.2]}
+    far: dict[str, Any] = {"position": [0.6, -1.2, 1.8], "target": [0.0, 0.0, 0.2]}
+    scene.setdefault("looks", {})["cameras"] = {"near": near, "far": far | more}
+    axes = {"texture": "dots", "viewpoint": ["near", "far"]}
+    return SCENE | {"scene": scene, "axes": axes, "ground_truth": ["depth"]}
+
+
+def test_a_camera_of_a_scene_may_have_its_size() -> None:
+    spec = _spec(_with_cameras(resolution=[320, 96]), resolution=[128, 128])
+    assert _shape(spec, "video")[1:] == (*_shape(spec, "depth")[1:], 3) == (128, 320, 3)
+    assert _shape(spec, "picture_size") == (2,)
+    sizes = {camera.name: (camera.width, camera.height) for camera in spec.cameras()}
+    assert sizes == {"near": (128, 128), "far": (320, 96)}
+    near, far = (spec.render(point) for point in spec.grid())
+    assert (near.picture_size, far.picture_size) == ((128, 128), (320, 96))
+    assert near.canvas == far.canvas == (320, 128)
+    # The shorter side shows the same angle: the focal length is one for a film of 36 mm.
+    focal = {camera.name: camera.fx / min(sizes[camera.name]) for camera in spec.cameras()}
+    assert focal["near"] == pytest.approx(focal["far"])
+
+
+def test_a_camera_of_a_scene_without_a_size_keeps_the_digest_of_its_spec() -> None:
+    plain = _spec(_with_cameras())
+    said = _spec(_with_cameras(resolution=None))
+    assert plain.content_digest == said.content_digest
+    assert "resolution" not in str(plain.model_dump(mode="json"))
+
+
+def test_a_camera_of_a_scene_with_a_wrong_size_is_named() -> None:
+    document = _with_cameras(resolution=[10, 10])
+    with pytest.raises(ValidationError) as raised:
+        _spec(document)
+    # A rig is possible, too, so there is another error beside this one.
+    rules = {e.pointer: e.rule for e in field_errors(raised.value, document, AnyJobSpec)}
+    assert "must be [width, height]" in rules["/scene/looks/cameras/far/resolution"]
 
 
 def test_a_viewpoint_that_no_sample_has_changes_no_array() -> None:

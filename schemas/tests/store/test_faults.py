@@ -156,7 +156,7 @@ def test_what_is_there_is_not_sent_again(proxy: Proxy, store: BucketStore) -> No
 
 
 def test_much_goes_wrong_at_once_and_nothing_is_lost(proxy: Proxy, store: BucketStore) -> None:
-    proxy.some(3, dict.fromkeys(FAULTS, 0.04))
+    proxy.inject_faults(3, dict.fromkeys(FAULTS, 0.04))
     artifacts = [SMALL[: 1000 * (k + 1)] for k in range(50)]
     with ThreadPoolExecutor(4) as writers:
         digests = list(writers.map(store.publish, artifacts * 2))

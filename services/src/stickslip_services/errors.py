@@ -60,14 +60,16 @@ class PresetNotCertifiedError(StickslipError):
 class QuotaExceededError(StickslipError):
     """A job would exceed the quota of its project."""
 
-    def __init__(self, project: str, quantity: str, limit: int, *, taken: int, asked: int) -> None:
-        value = taken + asked
+    def __init__(
+        self, project: str, quantity: str, limit: int, *, used: int, requested: int
+    ) -> None:
+        value = used + requested
         owner = f"the project {project!r}" if project else "requests without a project"
         rule = f"{quantity} of {owner} that have not ended must be at most {limit}"
         self.fields = [FieldError(pointer="", rule=rule, value=str(value))]
         super().__init__(
-            f"{rule}: there are {taken}, and with the {asked} of this job there would be {value}. "
-            "Wait until some of them have ended, or cancel some"
+            f"{rule}: there are {used}, and with the {requested} of this job there would be "
+            f"{value}. Wait until some of them have ended, or cancel some"
         )
 
 

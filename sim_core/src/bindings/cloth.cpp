@@ -77,9 +77,6 @@ void bind_cloth(nb::module_& m) {
       "outward normals there (N, 3).");
   m.def("self_intersections", &self_intersections, "positions"_a, "triangles"_a,
         "Internal: see stickslip_sim_core.self_intersections.");
-  m.def(
-      "cloth_constants", [] { return Constants().by_name(); },
-      "Internal: constants of the cloth solver by name; see cloth/settings.hpp.");
   nb::class_<DiagnosticExtremes>(m, "Observed",
                                  "Worst values over the accepted steps, for the checks of a run.")
       .def_ro("stretch", &DiagnosticExtremes::stretch, "Largest principal stretch of a triangle.")
@@ -104,6 +101,7 @@ void bind_cloth(nb::module_& m) {
           "Work of friction with each body, then surface, then sheet, and its estimated error "
           "[J].");
   m.attr("radius_least") = radius_least;
+  m.attr("compression") = compression;
   nb::class_<StepReport>(m, "StepReport", "How a step of cloth went, or several.")
       .def(nb::init<>())
       .def("add", &StepReport::add, "later"_a, "Add the report of later steps.")
@@ -150,35 +148,33 @@ void bind_cloth(nb::module_& m) {
           [](ClothSolver* self, const Points2& rest, const Triangles& triangles,
              const std::vector<FabricTuple>& fabrics, const std::vector<std::int32_t>& held,
              double tolerance, int newton_max, double krylov_tolerance, int refactor_after,
-             int patience, int halvings_max, double step_error, double longest_step, int finest,
-             const std::string& kernel, const std::vector<double>& thickness,
+             int newton_before_halving, int halvings_max, double step_error, double longest_step,
+             int finest, const std::string& kernel, const std::vector<double>& thickness,
              const Eigen::MatrixXd& mu, double edge_share, double second_share,
              const Triangles& surface_triangles, const std::vector<std::int32_t>& surface_of_vertex,
-             const Points3& surface_positions, const std::vector<double>& crease,
-             const std::map<std::string, double>& changed) {
-            const Constants constants(changed);
+             const Points3& surface_positions, const std::vector<double>& crease) {
             std::vector<ClothProperties> list;
             for (const auto& [density, stretching, rigidity, damping] : fabrics) {
               list.push_back({density, stretching, rigidity, damping});
             }
-            new (self) ClothSolver(
-                {rest,
-                 triangles,
-                 list,
-                 held,
-                 {tolerance, newton_max, krylov_tolerance, refactor_after, patience, halvings_max},
-                 {step_error, longest_step, finest},
-                 kernel,
-                 {thickness, mu, static_cast<int>(thickness.size() - crease.size()), edge_share,
-                  second_share, constants.contact.surface_share},
-                 {surface_triangles, surface_of_vertex, surface_positions, crease},
-                 constants});
+            new (self)
+                ClothSolver({rest,
+                             triangles,
+                             list,
+                             held,
+                             {tolerance, newton_max, krylov_tolerance, refactor_after,
+                              newton_before_halving, halvings_max},
+                             {step_error, longest_step, finest},
+                             kernel,
+                             {thickness, mu, static_cast<int>(thickness.size() - crease.size()),
+                              edge_share, second_share},
+                             {surface_triangles, surface_of_vertex, surface_positions, crease}});
           },
           "rest"_a, "triangles"_a, "fabrics"_a, "held"_a, nb::kw_only(), "tolerance"_a,
-          "newton_max"_a, "krylov_tolerance"_a, "refactor_after"_a, "patience"_a, "halvings_max"_a,
-          "step_error"_a, "longest_step"_a, "finest"_a, "kernel"_a, "thickness"_a, "mu"_a,
-          "edge_share"_a, "second_share"_a, "surface_triangles"_a, "surface_of_vertex"_a,
-          "surface_positions"_a, "crease"_a, "constants"_a = std::map<std::string, double>())
+          "newton_max"_a, "krylov_tolerance"_a, "refactor_after"_a, "newton_before_halving"_a,
+          "halvings_max"_a, "step_error"_a, "longest_step"_a, "finest"_a, "kernel"_a, "thickness"_a,
+          "mu"_a, "edge_share"_a, "second_share"_a, "surface_triangles"_a, "surface_of_vertex"_a,
+          "surface_positions"_a, "crease"_a)
       .def(
           "set_state",
           [](ClothSolver& self, const Points3& positions, const Points3& velocities,
@@ -198,7 +194,7 @@ void bind_cloth(nb::module_& m) {
       .def(
           "advance",
           [](ClothSolver& self, double time, double event, const MotionCallback& motion,
-             const PathCallback& path) {
+             const PathCallback& path, bool may_fail) {
             DriveNow now;
             nb::gil_scoped_release release;
             const auto drive = [&](double at) -> BoundaryConditions {
@@ -207,21 +203,25 @@ void bind_cloth(nb::module_& m) {
               now = {gravity, held, surfaces, bodies_of(bodies)};
               return {now.gravity, now.held, now.surfaces, now.bodies, damping};
             };
-            const StepReport report =
-                self.advance(time, event, drive, [&](const std::vector<double>& times) -> Track {
+            const StepReport report = self.advance(
+                time, event, drive,
+                [&](const std::vector<double>& times) -> Track {
                   nb::gil_scoped_acquire acquire;
                   auto [points, poses] = path(times);
                   return {points, poses};
-                });
+                },
+                may_fail);
             return std::make_tuple(time, report);
           },
-          "time"_a, "event"_a, "motion"_a, "path"_a)
+          "time"_a, "event"_a, "motion"_a, "path"_a, "may_fail"_a)
       .def("momentum_rate", &ClothSolver::momentum_rate)
       .def("positions", &ClothSolver::positions)
       .def("velocities", &ClothSolver::velocities)
       .def("reactions", &ClothSolver::reactions)
       .def("contacts", &ClothSolver::contacts)
       .def("sliding", &ClothSolver::sliding)
+      .def("opposites", &ClothSolver::opposites)
+      .def("opposite_forces", &ClothSolver::opposite_forces)
       .def("surface_forces", &ClothSolver::surface_forces)
       .def("pair_forces", &ClothSolver::pair_forces)
       .def("masses", &ClothSolver::masses)

@@ -133,7 +133,7 @@ void Membrane::set_lagged_stretch(const ClothKernel& kernel, const double* x, do
 
 Assembly::Assembly(const ClothKernel& kernel_in, const ClothMesh& mesh, const Fabrics& fabrics,
                    const std::vector<std::int32_t>& held, int others,
-                   const FactorSettings& settings)
+                   MatrixApproximation approximation)
     : kernel(kernel_in),
       stencils(bending_stencils(mesh, fabrics)),
       compact_stencils(bending_stencils(mesh, fabrics, true)),
@@ -151,7 +151,7 @@ Assembly::Assembly(const ClothKernel& kernel_in, const ClothMesh& mesh, const Fa
       stiffening_(2 * mesh.triangles.rows(), 0.0f),
       assembled_stiffening_(2 * mesh.triangles.rows(), -1.0f),
       unused_(4L * numbering.nodes, 0.0),
-      settings_(settings) {
+      approximation_(approximation) {
   for (Eigen::Index t = 0; t < mesh.triangles.rows(); ++t) {
     const ClothProperties& fabric = fabrics.at(t);
     rigidity_scale_.push_back(static_cast<float>(1.0 / fabric.rigidity.cwiseAbs().maxCoeff()));
@@ -184,7 +184,7 @@ void Assembly::reserve_folds() {
   fold_nodes_.assign(data.begin[data.triangles], 0);
   fold_vectors_.assign(8L * data.begin[data.triangles], 0.0f);
   fold_coefficients_.assign(2L * data.triangles, 0.0f);
-  folds_ = {numbering.free_nodes,     settings_.fold_smallest, 0,
+  folds_ = {numbering.free_nodes,     approximation_.fold_min, 0,
             fold_begin_.data(),       fold_nodes_.data(),      fold_vectors_.data(),
             fold_coefficients_.data()};
 }
@@ -206,7 +206,7 @@ void Assembly::assemble_bending() {
         {change_max, std::abs(stiffening_[2 * t] - assembled_stiffening_[2 * t]),
          rigidity_scale_[t] * std::abs(stiffening_[2 * t + 1] - assembled_stiffening_[2 * t + 1])});
   }
-  if (!(change_max > static_cast<float>(settings_.stiffening_change))) return;
+  if (!(change_max > static_cast<float>(approximation_.stiffening_change))) return;
   std::fill(scalars_.begin(), scalars_.end(), 0.0f);
   kernel.bending_matrix(bending_.data(), stiffening_.data(), scalars_.data());
   assembled_stiffening_ = stiffening_;

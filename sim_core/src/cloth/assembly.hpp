@@ -4,10 +4,10 @@
 #include <cstdint>
 #include <vector>
 
+#include "cloth/constants.hpp"
 #include "cloth/mesh.hpp"
 #include "cloth/numbering.hpp"
 #include "cloth/problem.hpp"
-#include "cloth/settings.hpp"
 #include "math/buffer.hpp"
 
 namespace sim_core {
@@ -49,11 +49,17 @@ struct NeighbourNumbers {
   Buffer<float> scalars, blocks;
 };
 
+// What a change or a fold may be without entering the matrix.
+struct MatrixApproximation {
+  double stiffening_change = factors::stiffening_change, fold_min = factors::fold_min;
+};
+
 class Assembly {
  public:
   // `others`: vertices of surfaces.
   Assembly(const ClothKernel& kernel, const ClothMesh& mesh, const Fabrics& fabrics,
-           const std::vector<std::int32_t>& held, int others, const FactorSettings& settings = {});
+           const std::vector<std::int32_t>& held, int others,
+           MatrixApproximation approximation = {});
   Assembly(const Assembly&) = delete;
 
   const ClothKernel kernel;
@@ -100,7 +106,7 @@ class Assembly {
   Buffer<float> scalars_, blocks_, diagonal_;
   Buffer<float> stiffening_, assembled_stiffening_;  // (triangles, 2)
   Buffer<double> unused_;
-  FactorSettings settings_;
+  MatrixApproximation approximation_;
   std::vector<int> fold_begin_, fold_nodes_;
   Buffer<float> fold_vectors_, fold_coefficients_;
   FoldData folds_{}, no_folds_{};

@@ -96,10 +96,17 @@ std::vector<double> cells_of_vertices(const ClothMesh& mesh) {
   return out;
 }
 
+std::vector<double> areas_of_vertices(const ClothMesh& mesh) {
+  std::vector<double> out(mesh.rest.rows(), 0.0);
+  for (Eigen::Index t = 0; t < mesh.triangles.rows(); ++t) {
+    for (int c = 0; c < 3; ++c) out[mesh.triangles(t, c)] += mesh.area[t] / 3.0;
+  }
+  return out;
+}
+
 std::unique_ptr<ContactSet> contact_set_of(const ClothMesh& mesh, const Numbering& numbering,
                                            const ContactMaterials& materials,
-                                           const SurfaceMeshes& surfaces,
-                                           const Constants& constants) {
+                                           const SurfaceMeshes& surfaces) {
   check_thickness(mesh, materials);
   Triples triangles;
   append(mesh.triangles, numbering.node.data(), triangles);
@@ -107,15 +114,13 @@ std::unique_ptr<ContactSet> contact_set_of(const ClothMesh& mesh, const Numberin
   Surface surface(std::move(triangles), sheets_of_nodes(mesh, numbering, surfaces),
                   (materials.mu.array() >= 0.0).matrix());
   const double cell = std::sqrt(2.0 * mesh.area.mean());
-  return std::make_unique<ContactSet>(std::move(surface), materials, constants.contact,
-                                      constants.path, constants.path.margin * cell,
+  return std::make_unique<ContactSet>(std::move(surface), materials, path::skin * cell,
                                       numbering.free_nodes);
 }
 
 std::unique_ptr<SmoothContact> smooth_contact_of(const ClothMesh& mesh, const Numbering& numbering,
                                                  const ContactMaterials& materials,
-                                                 const SurfaceMeshes& surfaces,
-                                                 const SmoothSettings& settings) {
+                                                 const SurfaceMeshes& surfaces) {
   Buffer<double> x(4L * numbering.nodes, 0.0);
   const int* others = numbering.node.data() + numbering.vertices;
   for (int i = 0; i < numbering.others; ++i)
@@ -132,7 +137,7 @@ std::unique_ptr<SmoothContact> smooth_contact_of(const ClothMesh& mesh, const Nu
   }
   return std::make_unique<SmoothContact>(std::move(triangles),
                                          sheets_of_nodes(mesh, numbering, surfaces), materials,
-                                         surfaces.crease, x, radius, settings);
+                                         surfaces.crease, x, radius);
 }
 
 }  // namespace sim_core

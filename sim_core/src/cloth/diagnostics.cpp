@@ -22,8 +22,8 @@ double sagitta(double radius, double circle) {
 
 // The contact of a node that touches body b, at the end of a step.
 BodyContact contact_with(const Newton& newton, const std::vector<Body>& bodies, int b,
-                         const Vector3d& p) {
-  const BodyContact on = newton.contact.body_contact(bodies, p);
+                         const Vector3d& p, int node) {
+  const BodyContact on = newton.contact.body_contact(bodies, p, node);
   return on.body == b ? on : BodyContact{gap_of(bodies[b], p), b};
 }
 
@@ -45,8 +45,8 @@ double angle_between(const Vector3d& a, const Vector3d& b) {
 
 }  // namespace
 
-StepDiagnostics::StepDiagnostics(const ClothMesh& mesh, const Assembly& assembly, double inside)
-    : assembly_(assembly), inside_(inside), cell_(mesh.rest.rows(), 0.0) {
+StepDiagnostics::StepDiagnostics(const ClothMesh& mesh, const Assembly& assembly)
+    : assembly_(assembly), cell_(mesh.rest.rows(), 0.0) {
   std::vector<int> around(mesh.rest.rows(), 0);
   for (Eigen::Index t = 0; t < mesh.triangles.rows(); ++t) {
     Matrix2d sides;
@@ -162,15 +162,16 @@ void StepDiagnostics::measure_contacts(const StepTaken& step, const Newton& newt
   for (int i = 0; i < assembly_.numbering.free_nodes; ++i) {
     const int b = newton.contact.touched[i];
     if (b < 0 || b >= static_cast<int>(step.at_end.size())) continue;
-    const Vector3d from = at_node(step.start, i), to = at_node(step.x, i),
-                   force = at_node(newton.residual, i);
-    const BodyContact on = contact_with(newton, step.at_end, b, to);
+    const Vector3d from = at_node(step.start, i), to = at_node(step.x, i);
+    const BodyContact on = contact_with(newton, step.at_end, b, to, i);
+    // An opposite body may push cloth to the face that it touches, as a spring does.
+    const Vector3d force = at_node(newton.residual, i) - newton.contact.press(on, i);
     if (on.others[0] >= 0 && !energy_) continue;  // a start in a corner is let out of its fillet
     // The change of a gap, and the share of its normal.
     const Vector2d displacement = on.mean([&](int body) -> Vector2d {
       const Gap gap = gap_of(step.at_end[body], to);
       const double before = gap_of(step.at_start[body], from).distance;
-      const bool may_be = before < 0.0 && before >= -inside_;
+      const bool may_be = before < 0.0 && before >= -inside_depth;
       return {gap.distance - (may_be ? 0.0 : before), gap.normal.dot(on.gap.normal)};
     });
     const Vector3d slip = ContactState::slip(on, from, to, step.at_start, step.at_end);
@@ -229,7 +230,7 @@ void StepDiagnostics::measure_friction(const StepTaken& step, const Newton& newt
     Vector3d slip;
     bool hollow = false;  // a fillet, where cloth does not turn round anything
     if (b < bodies) {
-      const BodyContact on = contact_with(newton, step.at_end, b, to);
+      const BodyContact on = contact_with(newton, step.at_end, b, to, i);
       slip = ContactState::slip(on, from, to, step.at_start, step.at_end);
       hollow = on.others[0] >= 0;
     } else {

@@ -7,6 +7,8 @@ namespace {
 
 // Subtrees of fewer nodes are made anew as one piece.
 constexpr int piece_nodes = 48;
+// Lengths of step that alternate: of late, and half and twice as long.
+constexpr std::size_t pool_max = 3;
 
 // Floats of the tiles of a front.
 long front_floats(long columns, long others) {
@@ -246,7 +248,7 @@ void FactorAge::spent(int iterations) {
   excess_ += std::max(0, last_ - fresh_);
 }
 
-FactorPool::FactorPool(const Numbering& numbering, int size) : numbering_(numbering), size_(size) {
+FactorPool::FactorPool(const Numbering& numbering) : numbering_(numbering) {
   factors_.push_back(std::make_unique<StaleFactor>(numbering));
 }
 
@@ -254,7 +256,7 @@ StaleFactor& FactorPool::of(double dt) {
   std::size_t place = 0;
   while (place < factors_.size() && !factors_[place]->age.fits(dt)) ++place;
   if (place == factors_.size()) {
-    if (place < size_) {
+    if (place < pool_max) {
       factors_.push_back(std::make_unique<StaleFactor>(numbering_));
     } else {
       --place;

@@ -96,8 +96,7 @@ class StaleFactor {
 // Factors for the lengths of step of late: a length that recurs is not factored again.
 class FactorPool {
  public:
-  // `size`: factors that are kept.
-  FactorPool(const Numbering& numbering, int size);
+  explicit FactorPool(const Numbering& numbering);
 
   // That for steps of dt, or one to be made in place of the one that was needed least recently.
   StaleFactor& of(double dt);
@@ -106,7 +105,6 @@ class FactorPool {
  private:
   std::vector<std::unique_ptr<StaleFactor>> factors_;  // the latest first
   const Numbering& numbering_;
-  std::size_t size_;
 };
 
 // The preconditioner while pairs are active: a factor with an order of its own, by nested
@@ -115,7 +113,7 @@ class FactorPool {
 // together through it.
 class PairFactor {
  public:
-  explicit PairFactor(const FactorSettings& constants) : constants_(constants) {}
+  PairFactor() = default;
   PairFactor(const PairFactor&) = delete;
 
   FactorAge age;
@@ -152,7 +150,6 @@ class PairFactor {
   template <class Call>
   void visit(const Entry& entry, const Call& call) const;
 
-  FactorSettings constants_;
   std::vector<int> order_, place_;  // nodes by place, and back
   std::vector<char> pinned_;        // nodes that stuck when the order was made
   Pattern bending_, membrane_;      // in places; both have those of pairs

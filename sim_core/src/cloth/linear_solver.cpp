@@ -4,21 +4,19 @@
 #include <limits>
 #include <utility>
 
+#include "cloth/constants.hpp"
 #include "cloth/newton.hpp"
 
 namespace sim_core {
 
 using Eigen::Vector3d;
 
-LinearSolver::LinearSolver(Assembly& assembly, const ClothSettings& settings,
-                           const Constants& constants, ContactState& contact)
-    : factors(assembly.numbering, constants.factor.pool),
+LinearSolver::LinearSolver(Assembly& assembly, const ClothSettings& settings, ContactState& contact)
+    : factors(assembly.numbering),
       step(4L * assembly.numbering.free_nodes + 64, 0.0f),
       assembly_(assembly),
       settings_(settings),
-      constants_(constants.newton),
       contact_(contact),
-      pair_factor_(constants.factor),
       work_((2 * krylov_max + 1) * 4L * assembly.numbering.free_nodes + 64, 0.0f),
       image_(step) {}
 
@@ -36,11 +34,11 @@ bool LinearSolver::solve(ContactSet* pairs, const Buffer<double>& x, double dt,
   if (!pairs) return false;
   int round = 0;
   if (pairs->smoothing == 0.0) {
-    for (; round < constants_.rounds_max && pairs->activate(step); ++round)
+    for (; round < newton::rounds_max && pairs->activate(step); ++round)
       solve_with_pairs(*pairs, x, dt, report);
   }
   pairs->solved(step);
-  return round == constants_.rounds_max;
+  return round == newton::rounds_max;
 }
 
 int LinearSolver::solve_with_pairs(ContactSet& pairs, const Buffer<double>& x, double dt,
@@ -50,8 +48,8 @@ int LinearSolver::solve_with_pairs(ContactSet& pairs, const Buffer<double>& x, d
   pair_rows_ = pairs.rows();
   assembly_.matrix.pairs = &pair_rows_;
   const double tolerance = pairs.smoothing > 0.0
-                               ? constants_.smooth_tolerance
-                               : std::min(settings_.krylov_tolerance, constants_.pairs_tolerance);
+                               ? newton::smoothed_tolerance
+                               : std::min(settings_.krylov_tolerance, newton::pairs_tolerance);
   const int iterations = solve_linear(&pairs, pair_factor_.view(), tolerance, report);
   assembly_.matrix.pairs = nullptr;
   return iterations;
@@ -64,7 +62,7 @@ int LinearSolver::solve_linear(const ContactSet* pairs, const Factor& factor,
   for (float f : contact_.force) size += static_cast<double>(f) * f;
   size = std::sqrt(size);
   const double tolerance = std::max(
-      krylov_tolerance, constants_.linear_share * settings_.tolerance / std::max(size, 1e-300));
+      krylov_tolerance, newton::linear_fraction * settings_.tolerance / std::max(size, 1e-300));
   for (int i = 0; i < 4 * assembly_.numbering.free_nodes; ++i) step[i] -= contact_.correction[i];
   const int iterations =
       assembly_.kernel.krylov(assembly_.matrix, factor, contact_.rows(), contact_.force.data(),

@@ -1,5 +1,6 @@
 #include <algorithm>
 
+#include "cloth/constants.hpp"
 #include "cloth/factor.hpp"
 
 namespace sim_core {
@@ -17,8 +18,8 @@ double PairFactor::renew(Assembly& assembly, const Buffer<double>& x, const Cont
   const double count = static_cast<double>(wanted_.size());
   // Under a smoothed law all pairs change all the time.
   bool whole = pairs.smoothing > 0.0 || !age.fits(dt) || age.too_much(settings);
-  if (!whole && !(changed > constants_.changed_share * count)) return 0.0;
-  if (!age.exists() || missing(contact) > constants_.missing_share * count) {
+  if (!whole && !(changed > factors::changed_fraction * count)) return 0.0;
+  if (!age.exists() || missing(contact) > factors::missing_fraction * count) {
     order(assembly, x, contact, pairs);
     compare(assembly, contact);
     whole = true;
@@ -67,14 +68,13 @@ int PairFactor::compare(const Assembly& assembly, const ContactState& contact) {
   }
   holds_ = bodies_;
   for (const Entry& entry : wanted_) add_holds(entry, holds_);
-  const float hold_change = static_cast<float>(constants_.hold_change);
-  const float hold_least = static_cast<float>(constants_.hold_least);
+  const float hold_change = static_cast<float>(factors::hold_change);
+  const float hold_min = static_cast<float>(factors::hold_min);
   int changed = 0;
   for (std::size_t i = 0; i < free_nodes; ++i) {
     const float difference = (holds_[i] - held_[i]).squaredNorm();
     if (difference == 0.0f) continue;
-    const float least =
-        hold_least * static_cast<float>(assembly.own_stiffness(static_cast<int>(i)));
+    const float least = hold_min * static_cast<float>(assembly.own_stiffness(static_cast<int>(i)));
     const float most =
         std::max({hold_change * hold_change * holds_[i].squaredNorm(),
                   hold_change * hold_change * held_[i].squaredNorm(), least * least});

@@ -25,23 +25,27 @@ struct ClothSolver::Impl {
         surfaces(setup.surfaces),
         materials(setup.touch),
         assembly(kernel_level(setup.kernel).cloth, mesh, Fabrics(mesh, setup.fabrics), setup.held,
-                 static_cast<int>(surfaces.surface_of_vertex.size()), setup.constants.factor),
-        stepper(mesh, assembly, setup.settings, setup.constants),
-        controller(stepper, setup.control, setup.constants.control),
+                 static_cast<int>(surfaces.surface_of_vertex.size())),
+        stepper(mesh, assembly, setup.settings),
+        controller(stepper, setup.control),
         newton(stepper.newton),
         numbering(assembly.numbering) {
     stepper.sheets = mesh.sheets;
     const std::vector<double> cells = cells_of_vertices(mesh);
+    const std::vector<double> areas = areas_of_vertices(mesh);
     for (int i = 0; i < numbering.free_nodes; ++i) {
-      newton.contact.sheet[i] = mesh.sheet_of_vertex[numbering.vertex[i]];
-      newton.contact.cell[i] = cells[numbering.vertex[i]];
+      const int vertex = numbering.vertex[i];
+      const int sheet = mesh.sheet_of_vertex[vertex];
+      newton.contact.sheet[i] = sheet;
+      newton.contact.cell[i] = cells[vertex];
+      newton.contact.area[i] = areas[vertex];
+      newton.contact.thickness[i] = materials.thickness[sheet];
     }
     if ((materials.mu.array() >= 0.0).any()) {
-      newton.pairs = contact_set_of(mesh, numbering, materials, surfaces, setup.constants);
+      newton.pairs = contact_set_of(mesh, numbering, materials, surfaces);
     }
     if (numbering.others > 0) {
-      newton.contact.surfaces =
-          smooth_contact_of(mesh, numbering, materials, surfaces, setup.constants.smooth);
+      newton.contact.surfaces = smooth_contact_of(mesh, numbering, materials, surfaces);
     }
   }
 
@@ -79,6 +83,15 @@ struct ClothSolver::Impl {
     int unfelt = self_intersections(others, surfaces.triangles);
     if (!(materials.mu(0, 0) >= 0.0)) unfelt += self_intersections(positions, mesh.triangles);
     return self_intersections(points, all) > unfelt;
+  }
+
+  // What a free node that touches a body sees of the bodies; none where it touches none.
+  BodyContact contact_at_end(int node) const {
+    const std::vector<Body>& bodies = stepper.bodies();
+    const int touched = newton.contact.touched[node];
+    if (touched < 0 || touched >= static_cast<int>(bodies.size())) return {};
+    const BodyContact on = newton.contact.body_contact(bodies, at_node(stepper.x, node), node);
+    return on.body == touched ? on : BodyContact{};
   }
 
   Points3 unload(const Buffer<double>& from) const {
@@ -122,9 +135,10 @@ StepReport ClothSolver::step(double dt, const Points3& gravity, const Points3& h
   return impl_->stepper.step(dt, {gravity, held, surfaces, bodies, damping});
 }
 
-StepReport ClothSolver::advance(double& time, double event, const Motion& motion,
-                                const Path& path) {
+StepReport ClothSolver::advance(double& time, double event, const Motion& motion, const Path& path,
+                                bool may_fail) {
   if (!impl_->stepper.started()) begin(motion(time).bodies);
+  impl_->stepper.may_fail = may_fail;
   return impl_->controller.advance(time, event, motion, path);
 }
 
@@ -147,6 +161,29 @@ std::vector<std::int32_t> ClothSolver::sliding() const {
   std::vector<std::int32_t> out(numbering.vertices, 0);
   for (int i = 0; i < numbering.free_nodes; ++i) {
     out[numbering.vertex[i]] = impl_->newton.contact.mode[i] == contact_slip;
+  }
+  return out;
+}
+
+std::vector<std::int32_t> ClothSolver::opposites() const {
+  std::vector<std::int32_t> out(impl_->numbering.vertices, -1);
+  for (int i = 0; i < impl_->numbering.free_nodes; ++i) {
+    out[impl_->numbering.vertex[i]] = impl_->contact_at_end(i).opposite;
+  }
+  return out;
+}
+
+Points3 ClothSolver::opposite_forces() const {
+  Points3 out = Points3::Zero(impl_->numbering.vertices, 3);
+  for (int i = 0; i < impl_->numbering.free_nodes; ++i) {
+    const BodyContact on = impl_->contact_at_end(i);
+    if (on.opposite < 0) continue;
+    const Eigen::Vector3d press = impl_->newton.contact.press(on, i);
+    const Eigen::Vector3d borne = at_node(impl_->newton.residual, i) - press;
+    const double normal_force = borne.dot(on.gap.normal);
+    const Eigen::Vector3d friction = borne - normal_force * on.gap.normal;
+    const double share = press.norm() / (std::max(normal_force, 0.0) + press.norm());
+    out.row(impl_->numbering.vertex[i]) = (press + share * friction).transpose();
   }
   return out;
 }

@@ -35,16 +35,16 @@ struct SurfaceMeshes {
 double cell_of(const ClothMesh& mesh);
 // Side of a cell around each vertex, m: that of a square of two of its triangles.
 std::vector<double> cells_of_vertices(const ClothMesh& mesh);
+// Area of the cloth that belongs to each vertex, m^2.
+std::vector<double> areas_of_vertices(const ClothMesh& mesh);
 
 // Throws std::invalid_argument, naming the field, where the cloth would touch itself at rest.
 std::unique_ptr<ContactSet> contact_set_of(const ClothMesh& mesh, const Numbering& numbering,
                                            const ContactMaterials& materials,
-                                           const SurfaceMeshes& surfaces,
-                                           const Constants& constants);
+                                           const SurfaceMeshes& surfaces);
 std::unique_ptr<SmoothContact> smooth_contact_of(const ClothMesh& mesh, const Numbering& numbering,
                                                  const ContactMaterials& materials,
-                                                 const SurfaceMeshes& surfaces,
-                                                 const SmoothSettings& settings);
+                                                 const SurfaceMeshes& surfaces);
 
 // What a solver is made of.
 struct ClothSetup {
@@ -57,7 +57,6 @@ struct ClothSetup {
   std::string kernel;      // level of the kernels, "" for the widest that this processor runs
   ContactMaterials touch;  // among the sheets and then the surfaces
   SurfaceMeshes surfaces;
-  Constants constants;
 };
 
 class ClothSolver {
@@ -76,8 +75,9 @@ class ClothSolver {
   StepReport step(double dt, const Points3& gravity, const Points3& held, const Points3& surfaces,
                   const std::vector<Body>& bodies, double damping);
 
-  // A step of the controller's choice: see StepController::advance.
-  StepReport advance(double& time, double event, const Motion& motion, const Path& path);
+  // A step of the controller's choice: see StepController::advance, and Stepper for `may_fail`.
+  StepReport advance(double& time, double event, const Motion& motion, const Path& path,
+                     bool may_fail);
   // Rate of the cloth's momentum in the last step, N: the sum of all forces.
   Eigen::Vector3d momentum_rate() const;
 
@@ -90,6 +90,10 @@ class ClothSolver {
   // slides.
   std::vector<std::int32_t> contacts() const;
   std::vector<std::int32_t> sliding() const;
+  // Which body presses each vertex against that one from the other side (-1: none), and its force
+  // on the vertex, N: its share of friction is that of the normal forces.
+  std::vector<std::int32_t> opposites() const;
+  Points3 opposite_forces() const;
 
   // Force of the cloth on each vertex of the surfaces at the end of the last step, N.
   Points3 surface_forces() const;

@@ -17,6 +17,8 @@ using Eigen::Vector4d;
 constexpr double parallel = 1e-14;
 // Bounds the work where pieces slide past each other much slower than the bound of their speed.
 constexpr int advances_max = 1000;
+// Share of a distance that one advance leaves: s of the algorithm.
+constexpr double step_rest = 0.1;
 
 Eigen::Vector2d closest_on_segments(const FourPoints& x) {
   const Vector3d u = x[1] - x[0], v = x[3] - x[2], r = x[0] - x[2];
@@ -108,8 +110,8 @@ double safe_share(PairKind kind, const FourPoints& x, const FourPoints& to,
     // The distance is at least `least` up to here, and above 0 up to `next`.
     const double safe = share + (distance - least) / fastest;
     if (safe >= 1.0) return 1.0;
-    const double next = std::min(
-        1.0, share + std::max((1.0 - rule_of.rest) * distance, distance - least) / fastest);
+    const double next =
+        std::min(1.0, share + std::max((1.0 - step_rest) * distance, distance - least) / fastest);
     for (int i = 0; i < 4; ++i) at[i] = x[i] + next * motion[i];
     const double before =
         std::exchange(distance, between_closest(closest_weights(kind, at), at).norm());

@@ -43,7 +43,6 @@ struct MinDistanceRule {
   double share;
   double most;
   double floor = 0.0;
-  double rest = 0.1;  // see PathSettings
 
   double of(double distance) const;
 };

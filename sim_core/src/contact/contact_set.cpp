@@ -6,6 +6,8 @@
 #include <cmath>
 #include <limits>
 
+#include "contact/constants.hpp"
+
 namespace sim_core {
 namespace {
 
@@ -187,7 +189,7 @@ bool ContactSet::warm_start() {
   bool any = false;
   for (Pair& pair : pairs_) {
     if (pair.active() || pair.contact.force.isZero(0.0) ||
-        pair.contact.gap > settings_.closing_gap * pair.thickness)
+        pair.contact.gap > pairs::closing_gap * pair.thickness)
       continue;
     Contact touching = pair.contact;
     touching.gap = 0.0;
@@ -218,7 +220,7 @@ bool ContactSet::activate(const Buffer<float>& change) {
       if (pair.stencil.kind != kind || pair.active() || pair.released) continue;
       const Vector3d motion = pair.motion(change, free_nodes_);
       if (!(pair.contact.gap + pair.contact.normal.dot(motion) <
-            -settings_.closing_gap * pair.thickness))
+            -pairs::closing_gap * pair.thickness))
         continue;
       pair.row = pair_row(pair.contact, closing(pair.contact, motion), pair.proximal);
       pair.added = any = true;

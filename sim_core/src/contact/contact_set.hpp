@@ -10,7 +10,6 @@
 #include "contact/linearized_contact.hpp"
 #include "contact/path.hpp"
 #include "contact/rows.hpp"
-#include "contact/settings.hpp"
 #include "contact/state.hpp"
 #include "contact/surface.hpp"
 
@@ -72,9 +71,8 @@ double violation(const Contact& contact, int mode);
 
 class ContactSet {
  public:
-  // `margin`: distance that nodes move before candidates are searched again, m.
-  ContactSet(Surface surface, const ContactMaterials& materials, const ContactSettings& settings,
-             const PathSettings& path, double margin, int free_nodes);
+  // `skin`: distance that nodes move before candidates are searched again, m.
+  ContactSet(Surface surface, const ContactMaterials& materials, double skin, int free_nodes);
 
   double smoothing = 0.0;  // length over which the law is smoothed, m; 0: the exact law
   bool stiff = false;      // along the normals, too
@@ -156,7 +154,6 @@ class ContactSet {
     Eigen::Vector4d weights;
   };
 
-  ContactSettings settings_;
   int free_nodes_;
   double least_distance_;
   std::vector<double> displacements_;  // of each node in the step but for a common one, m

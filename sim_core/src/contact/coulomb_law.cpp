@@ -53,7 +53,7 @@ LawResponse sticking(const Contact& contact) {
   law.direction = direction_of(friction, contact.normal);
   law.normal_force = asked_normal(contact);
   law.friction = friction;
-  law.bearing_force = std::max(contact.normal_force(), 0.0);
+  law.bearing_force = std::max(contact.normal_force(), 0.0) + contact.pressed;
   law.derivative = {1.0, 1.0, 1.0, 0.0};
   return law;
 }
@@ -65,7 +65,7 @@ LawResponse slipping(const Contact& contact) {
   law.mode = contact_slip;
   law.direction = direction_of(friction, contact.normal);
   law.normal_force = asked_normal(contact);
-  law.bearing_force = std::max(contact.normal_force(), 0.0);
+  law.bearing_force = std::max(contact.normal_force(), 0.0) + contact.pressed;
   // Here mu enters: it bounds friction, and it couples friction to the normal force.
   const double bound = contact.mu * law.bearing_force;
   law.friction = bound * law.direction;
@@ -88,7 +88,7 @@ LawResponse slipping_along(const Contact& contact, const Vector3d& direction, do
 LawResponse coulomb_law(const Contact& contact) {
   const double normal_force = asked_normal(contact);
   if (!(normal_force > 0.0)) return {};
-  const double bearing_force = std::max(contact.normal_force(), normal_force);
+  const double bearing_force = std::max(contact.normal_force(), normal_force) + contact.pressed;
   const bool sticks =
       contact.mu > 0.0 && asked_friction(contact).norm() <= contact.mu * bearing_force;
   return sticks ? sticking(contact) : slipping(contact);

@@ -8,13 +8,14 @@
 // [Alart & Curnier 1991, Eqs. 10-12]:
 //
 //     P_N = max(0, z_N)
-//     P_T = projection of z_T on the disc of radius mu r_N
+//     P_T = projection of z_T on the disc of radius mu (r_N + q)
 //
-// so that a contact is open (r = 0), sticks (g = 0, u = 0) or slips (g = 0, r_T = mu r_N t, t =
-// z_T/|z_T|). Where Newton's method does not find which contacts bear and which slip, the law is
-// smoothed over an energy epsilon, as by the logarithms of the slack in r_N >= 0 and in |r_T| <= mu
-// r_N: r_N g = epsilon and u = -2 epsilon r_T/((mu r_N)^2 - |r_T|^2). In the form above, which
-// holds whatever sign g has [Chen & Harker 1993; Kanzow 1996],
+// so that a contact is open (r = 0), sticks (g = 0, u = 0) or slips (g = 0, r_T = mu (r_N + q) t,
+// t = z_T/|z_T|). The force q is that of a body on the other side, or 0. Where Newton's method does
+// not find which contacts bear and which slip, the law is smoothed over an energy epsilon, as by
+// the logarithms of the slack in r_N >= 0 and in |r_T| <= mu r_N: r_N g = epsilon and u = -2
+// epsilon r_T/((mu r_N)^2 - |r_T|^2). In the form above, which holds whatever sign g has [Chen &
+// Harker 1993; Kanzow 1996],
 //
 //     P_N = (z_N + sqrt(z_N^2 + 4 k epsilon))/2
 //     P_T = rho t,  rho + 2 k epsilon rho/((mu P_N)^2 - rho^2) = |z_T|
@@ -28,7 +29,7 @@
 //              a    b_t    b_s              c
 //     open     0    0      0                0
 //     stick    1    1      1                0
-//     slip     1    0      mu r_N/|z_T|     mu
+//     slip     1    0      mu (r_N + q)/|z_T|  mu
 //
 // The smoothed law has values between these. How the contact enters the linear system is no part of
 // the law: see linearized_contact.hpp.
@@ -49,6 +50,7 @@ struct Contact {
   Eigen::Vector3d force;   // r, N
   double mu;               // coefficient of friction
   double stiffness;        // k, N/m
+  double pressed = 0.0;    // q, N: by what presses from the other side, where friction acts, too
 
   double normal_force() const { return force.dot(normal); }
   Eigen::Vector3d friction() const { return force - normal_force() * normal; }
@@ -68,7 +70,7 @@ struct LawResponse {
   Eigen::Vector3d direction = Eigen::Vector3d::Zero();  // t
   double normal_force = 0.0;                            // P_N, N
   Eigen::Vector3d friction = Eigen::Vector3d::Zero();   // P_T, N
-  double bearing_force = 0.0;                           // N: the bound of friction is mu times this
+  double bearing_force = 0.0;  // N: of both sides; the bound of friction is mu times this
   LawDerivative derivative;
 };
 

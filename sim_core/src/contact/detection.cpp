@@ -4,6 +4,7 @@
 #include <limits>
 #include <utility>
 
+#include "contact/constants.hpp"
 #include "contact/contact_set.hpp"
 
 namespace sim_core {
@@ -12,6 +13,10 @@ namespace {
 using Eigen::Matrix3d;
 using Eigen::Vector3d;
 using Eigen::Vector4d;
+
+// Share of the length of an edge, from its ends, within which it makes no pair: the vertex does.
+// Far above rounding, far below what moves a force.
+constexpr double end_weight = 1e-3;
 
 // Derivatives of the weights by the places of the closest points: along both edges, or along the
 // sides of the feature of a triangle.
@@ -38,16 +43,13 @@ std::pair<Vector4d, Vector4d> directions(PairKind kind, const Vector4d& weights)
 
 }  // namespace
 
-ContactSet::ContactSet(Surface surface, const ContactMaterials& materials_in,
-                       const ContactSettings& settings, const PathSettings& path, double margin,
+ContactSet::ContactSet(Surface surface, const ContactMaterials& materials_in, double skin,
                        int free_nodes)
-    : near(std::move(surface), materials_in.farthest(), margin, path),
+    : near(std::move(surface), materials_in.farthest(), skin),
       materials(materials_in),
-      settings_(settings),
       free_nodes_(free_nodes),
       least_distance_(std::numeric_limits<double>::infinity()),
-      displacements_(near.surface.sheet_of_node.size()),
-      turns_(settings.turn_max) {}
+      displacements_(near.surface.sheet_of_node.size()) {}
 
 void ContactSet::begin(const Buffer<double>& start, const Buffer<double>& ends,
                        const Buffer<double>& expected, std::vector<Matrix3d> own) {
@@ -60,7 +62,7 @@ void ContactSet::begin(const Buffer<double>& start, const Buffer<double>& ends,
 
 void ContactSet::find(const Buffer<double>& x) {
   std::vector<Candidate>& candidates = near.pairs(x);
-  const double range = (settings_.detection_range - 1.0) * near.thickness;
+  const double range = (pairs::detection_range - 1.0) * near.thickness;
   near.measure(*start_, x, displacements_);
   pairs_.clear();
   least_distance_ = std::numeric_limits<double>::infinity();
@@ -157,8 +159,8 @@ void ContactSet::find_edges(std::vector<Candidate>& candidates, double range,
     const FourPoints at = points_of(stencil, x);
     const Vector4d weights = closest_weights(stencil.kind, at);
     stencil.distance = between_closest(weights, at).norm();
-    if (stencil.distance > reach || weights.cwiseAbs().minCoeff() < settings_.end_share ||
-        crossing_squared(at) < settings_.crossing_least)
+    if (stencil.distance > reach || weights.cwiseAbs().minCoeff() < end_weight ||
+        crossing_squared(at) < pairs::crossing_min)
       continue;
     add(stencil, stencil.second, weights, x);
   }
@@ -186,24 +188,25 @@ void ContactSet::add(const Candidate& stencil, int feature, const Vector4d& weig
     given.segment<3>(6) += along_second[c] * displacement;
   }
   const Vector3d n = rho / distance;
-  const double share = stiff ? settings_.stiff_mean_share : settings_.mean_share;
+  const double mean_fraction = stiff ? 1.0 : stiffness::mean_fraction;
   double softness = 0.0, softness_along = 0.0;  // m/N: in the mean, and along the normal
   for (int c = 0; c < 4; ++c) {
     if (stencil.node[c] >= free_nodes_) continue;
     const Matrix3d& own = own_[stencil.node[c]];
     const double mean = own.trace() / 3.0;
     softness += weights[c] * weights[c] / mean;
-    softness_along += weights[c] * weights[c] / (share * mean + std::max(n.dot(own * n), 0.0));
+    softness_along +=
+        weights[c] * weights[c] / (mean_fraction * mean + std::max(n.dot(own * n), 0.0));
   }
   if (!(softness > 0.0)) return;
   Vector3d slip = this->slip(stencil, weights, rho);
   slip -= slip.dot(n) * n;
   const double thickness = materials.rest_distance(stencil.kind, a, b),
-               k = settings_.law_stiffness / softness;
-  const double along =
-      smoothing > 0.0 ? settings_.smooth_proximal / softness : settings_.proximal / softness_along;
+               k = stiffness::law / softness;
+  const double along = smoothing > 0.0 ? stiffness::smoothed_proximal / softness
+                                       : stiffness::proximal / softness_along;
   const double across =
-      (smoothing > 0.0 ? settings_.smooth_proximal : settings_.proximal) / softness;
+      (smoothing > 0.0 ? stiffness::smoothed_proximal : stiffness::proximal) / softness;
   const Vector3d first = stencil.kind == PairKind::vertex_triangle
                              ? at[0]
                              : Vector3d(weights[0] * at[0] + weights[1] * at[1]);

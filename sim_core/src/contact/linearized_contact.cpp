@@ -38,7 +38,8 @@ NodeRow node_row(const Contact& contact, const LawResponse& law, double turning_
   const double scale = freedom * turning_max > 1.0 ? 1.0 / freedom : turning_max;
   row.turning = scale * d.across * contact.stiffness;
   const Vector3d lacking = law.friction - contact.friction();
-  const double along = t.dot(lacking) + d.coupling * (contact.normal_force() - law.bearing_force);
+  const double bearing_force = contact.normal_force() + contact.pressed;
+  const double along = t.dot(lacking) + d.coupling * (bearing_force - law.bearing_force);
   row.force = along * t + scale * (lacking - t.dot(lacking) * t);
   return row;
 }

@@ -4,6 +4,7 @@
 #include <tuple>
 #include <utility>
 
+#include "contact/constants.hpp"
 #include "contact/contact_set.hpp"
 
 namespace sim_core {
@@ -35,10 +36,10 @@ void ContactSet::transfer(double share) {
       const int mode = base_[o].mode;
       const double last = base_[o].missed, now = violation(pairs_[i].contact, mode);
       if (smoothing == 0.0 && share == 1.0 && mode != contact_open &&
-          last > settings_.length_tolerance && last < settings_.stall_up_to * pairs_[i].thickness &&
-          now > settings_.stall_ratio * last) {
+          last > pairs::length_tolerance && last < pairs::half_layer * pairs_[i].thickness &&
+          now > pairs::converging * last) {
         pairs_[i].penalty_scale =
-            std::min(settings_.penalty_growth * base_[o].penalty_scale, settings_.penalty_max);
+            std::min(stiffness::growth * base_[o].penalty_scale, stiffness::growth_max);
       }
       pairs_[i].proximal.normal *= pairs_[i].penalty_scale;
       pairs_[i].proximal.tangential *= pairs_[i].penalty_scale;
@@ -52,7 +53,7 @@ void ContactSet::transfer(double share) {
     const Vector3d force = orphan->force + share * orphan->change;
     if (force.isZero(0.0)) continue;
     std::size_t match = pairs_.size();
-    double best = settings_.match_cosine;
+    double best = pairs::match_cosine;
     for (std::size_t i : fresh) {
       const Candidate &a = pairs_[i].stencil, &b = orphan->stencil;
       if (a.kind != b.kind) continue;
@@ -68,11 +69,11 @@ void ContactSet::transfer(double share) {
       pairs_[match].contact.force += force;
       continue;
     }
-    best = settings_.transfer_radius * orphan->thickness;
+    best = pairs::half_layer * orphan->thickness;
     for (std::size_t i = 0; i < pairs_.size(); ++i) {
       const double far = (pairs_[i].middle - orphan->middle).norm();
       const double alike = pairs_[i].contact.normal.dot(orphan->normal);
-      if (far < best && std::abs(alike) > settings_.match_cosine) best = far, match = i;
+      if (far < best && std::abs(alike) > pairs::match_cosine) best = far, match = i;
     }
     if (match < pairs_.size()) {
       pairs_[match].contact.force +=
@@ -105,7 +106,7 @@ void ContactSet::merge() {
   std::vector<char> gone(count, 0);
   for (std::size_t i : order) {
     if (gone[i]) continue;
-    const double radius = settings_.merge_radius * pairs_[i].thickness;
+    const double radius = pairs::merge_radius * pairs_[i].thickness;
     const auto take = [&](std::size_t j) {
       if (gone[j] || (pairs_[j].middle - pairs_[i].middle).squaredNorm() > radius * radius) return;
       const Vector3d& force = pairs_[j].contact.force;

@@ -4,10 +4,15 @@
 #include <algorithm>
 #include <utility>
 
+#include "contact/constants.hpp"
+
 namespace sim_core {
 namespace {
 
 using Eigen::AlignedBox3d;
+
+// Rounds in which nodes are stopped one by one; after them all are stopped by the same share.
+constexpr int rounds_max = 8;
 
 AlignedBox3d box_of_ways(const Surface& surface, const Buffer<double>& from,
                          const Buffer<double>& to) {
@@ -28,18 +33,16 @@ double fastest(const Candidate& pair, const std::vector<double>& displacements) 
          std::max(displacements[node[2]], displacements[node[3]]);
 }
 
-CandidateSet::CandidateSet(Surface surface_in, double thickness_in, double margin,
-                           const PathSettings& settings)
+CandidateSet::CandidateSet(Surface surface_in, double thickness_in, double skin)
     : surface(std::move(surface_in)),
       thickness(thickness_in),
-      margin_(margin),
-      settings_(settings),
+      skin_(skin),
       share_(surface.sheet_of_node.size(), 1.0),
       drift_(share_),
       displacement_(share_) {}
 
 MinDistanceRule CandidateSet::rule() const {
-  return {settings_.keep, thickness, settings_.floor * thickness, settings_.rest};
+  return {path::distance_fraction, thickness, path::distance_min * thickness};
 }
 
 // Half of the diagonal of the box of the motions.
@@ -61,11 +64,11 @@ Eigen::Vector3d CandidateSet::measure(const Buffer<double>& from, const Buffer<d
 
 void CandidateSet::rebuild(const Buffer<double>& x) {
   reference_ = at_ = x;
-  pairs_ = candidates(surface, x, thickness + 2.0 * margin_);
+  pairs_ = candidates(surface, x, thickness + 2.0 * skin_);
 }
 
 std::vector<Candidate>& CandidateSet::pairs(const Buffer<double>& x) {
-  if (reference_.empty() || !(moved(reference_, x) <= margin_)) rebuild(x);
+  if (reference_.empty() || !(moved(reference_, x) <= skin_)) rebuild(x);
   measure(at_, x, displacement_);
   for (Candidate& pair : pairs_) pair.distance -= fastest(pair, displacement_);
   at_ = x;
@@ -73,11 +76,10 @@ std::vector<Candidate>& CandidateSet::pairs(const Buffer<double>& x) {
 }
 
 bool CandidateSet::limit_by_ccd(const Buffer<double>& from, Buffer<double>& to, int hops_max) {
-  if (!reference_.empty() && moved(reference_, from) <= margin_ &&
-      moved(reference_, to) <= margin_) {
+  if (!reference_.empty() && moved(reference_, from) <= skin_ && moved(reference_, to) <= skin_) {
     Buffer<double> capped = to;
     if (limit_listed(from, capped)) return true;
-    if (moved(reference_, from, &to) <= margin_) {
+    if (moved(reference_, from, &to) <= skin_) {
       to = std::move(capped);
       return false;
     }
@@ -90,14 +92,14 @@ bool CandidateSet::limit_by_ccd(const Buffer<double>& from, Buffer<double>& to, 
       for (int i : surface.vertices) at_node(out, i) += share * (at_node(to, i) - at_node(at, i));
       return out;
     };
-    // From the middle of a hop both of its ends are within the margin, but for a common
+    // From the middle of a hop both of its ends are within the skin, but for a common
     // displacement. Nodes that are stopped do not go that: so where there are any, the hop is
     // shorter.
-    double share = std::min(1.0, 2.0 * margin_ / moved(at, to));
+    double share = std::min(1.0, 2.0 * skin_ / moved(at, to));
     rebuild(part(0.5 * share));
     Buffer<double> wanted = part(share), next = wanted;
     bool stopped = !limit_listed(at, next);
-    const double shorter = margin_ / moved(part(0.5), at, &to);
+    const double shorter = skin_ / moved(part(0.5), at, &to);
     if (stopped && shorter < share) {
       share = shorter;
       rebuild(part(0.5 * share));
@@ -154,18 +156,18 @@ bool CandidateSet::limit_listed(const Buffer<double>& from, Buffer<double>& to) 
     displacement_[i] = (limited(i, from, to) - at_node(from, i) - common).norm();
   };
   bool whole = true;
-  for (int round = 0; round <= settings_.rounds_max; ++round) {
+  for (int round = 0; round <= rounds_max; ++round) {
     double least = 1.0;
     for (const Candidate& pair : pairs_) {
       const double safe = safe_share_of(pair, from, to);
       if (safe == 1.0) continue;
       least = std::min(least, safe);
-      if (round == settings_.rounds_max) continue;
+      if (round == rounds_max) continue;
       for (int i : pair.node) shorten(i, safe);
     }
     if (least == 1.0) break;
     whole = false;
-    if (round == settings_.rounds_max) {
+    if (round == rounds_max) {
       for (int i : surface.vertices) share_[i] *= least;
     }
   }

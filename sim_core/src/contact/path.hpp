@@ -5,7 +5,6 @@
 #include <vector>
 
 #include "contact/closest.hpp"
-#include "contact/settings.hpp"
 #include "contact/surface.hpp"
 #include "math/buffer.hpp"
 
@@ -33,10 +32,10 @@ double fastest(const Candidate& pair, const std::vector<double>& displacements);
 std::vector<Candidate> candidates(const Surface& surface, const Buffer<double>& x, double reach);
 
 // Knows which pairs are near: all that can come within `thickness`, the largest, while no node has
-// moved further than `margin` from where it was, whatever common displacement all have come.
+// moved further than `skin` from where it was, whatever common displacement all have come.
 class CandidateSet {
  public:
-  CandidateSet(Surface surface, double thickness, double margin, const PathSettings& settings = {});
+  CandidateSet(Surface surface, double thickness, double skin);
 
   const Surface surface;
   const double thickness;
@@ -47,14 +46,14 @@ class CandidateSet {
   // Moves `to` back towards `from` where a pair would come nearer than half its distance or half
   // the thickness, so that nothing crosses on the straight paths between: each node by as
   // much as its pairs demand. Returns whether nothing was moved. Ways of more than `hops_max` times
-  // two margins end there: pairs are looked for anew on each hop.
+  // two skins end there: pairs are looked for anew on each hop.
   bool limit_by_ccd(const Buffer<double>& from, Buffer<double>& to, int hops_max = 64);
 
   // The share of the straight path from `from` to `to` that all nodes can go together, so
   // that every pair that is near at `from` keeps half its distance or half the thickness.
   double collision_free_fraction(const Buffer<double>& from, const Buffer<double>& to);
 
-  double margin() const { return margin_; }
+  double skin() const { return skin_; }
 
   // Of each vertex the length of its displacement but for a common one, which it returns: the
   // middle of the box of all displacements.
@@ -74,8 +73,7 @@ class CandidateSet {
   double safe_share_of(const Candidate& pair, const Buffer<double>& from,
                        const Buffer<double>& to) const;
 
-  double margin_;
-  PathSettings settings_;
+  double skin_;
   std::vector<Candidate> pairs_;
   Buffer<double> reference_, at_;  // where they were looked for, and where their distances are from
   std::vector<double> share_, drift_, displacement_;

@@ -22,6 +22,15 @@ constexpr double inside = -1e-9;
 // Triangles that a projection may move over in a search, which starts from the nearest: a bound
 // against cycles.
 constexpr int hops_max = 100;
+// Barycentric distance beyond an edge at which the search goes on in the next triangle.
+constexpr double beyond_edge = 0.6;
+// Barycentric distance within which a projection between two triangles belongs to either.
+constexpr double between_triangles = 1e-4;
+// Jacobian of the map to a projection, over that of the triangle, below which there is none: at 0
+// the point is a centre of curvature.
+constexpr double jacobian_min = 0.1;
+// Sine of the angle of the normals of the two sides of an edge below which they are one.
+constexpr double same_normal = 1e-3;
 
 }  // namespace
 
@@ -82,7 +91,7 @@ double PNPatch::closest_on_edge(int k, const Vector3d& p) const {
   return s;
 }
 
-PNRoot::PNRoot(const PNPatch& patch, const Vector3d& p, const SmoothSettings& settings) {
+PNRoot::PNRoot(const PNPatch& patch, const Vector3d& p) {
   const Vector3d u = patch.corner[1] - patch.corner[0], v = patch.corner[2] - patch.corner[0],
                  w = u.cross(v);
   const Vector3d from = p - patch.corner[0];
@@ -90,14 +99,14 @@ PNRoot::PNRoot(const PNPatch& patch, const Vector3d& p, const SmoothSettings& se
   b[2] = u.cross(from).dot(w) / w.squaredNorm();
   b[0] = 1.0 - b[1] - b[2];
   double share = from.dot(w) / w.norm();  // height over |n|, which is nearly 1
-  for (int i = 0; i < iterations_max && b.minCoeff() > -settings.beyond_edge; ++i) {
+  for (int i = 0; i < iterations_max && b.minCoeff() > -beyond_edge; ++i) {
     const Matrix3d slope = patch.dy(b) + share * patch.dn(b);
     normal = patch.n(b);
     Matrix3d jacobian;
     jacobian << slope.col(1) - slope.col(0), slope.col(2) - slope.col(0), normal;
     const double size = jacobian.determinant();
     // Beyond a centre of curvature the axes turn over.
-    if (!(size > settings.fold_over * w.norm())) return;
+    if (!(size > jacobian_min * w.norm())) return;
     const Vector3d change = jacobian.inverse() * (p - patch.y(b) - share * normal);
     b += Vector3d(-change[0] - change[1], change[0], change[1]);
     share += change[2];
@@ -112,8 +121,8 @@ PNRoot::PNRoot(const PNPatch& patch, const Vector3d& p, const SmoothSettings& se
 }
 
 PNTriangles::PNTriangles(std::vector<std::array<int, 3>> triangles, const Buffer<double>& x,
-                         const std::vector<double>& crease, const SmoothSettings& settings)
-    : mesh_(std::move(triangles), x, crease), settings_(settings) {}
+                         const std::vector<double>& crease)
+    : mesh_(std::move(triangles), x, crease) {}
 
 // Normals of corners, by the edges e and f that leave them: sum of e x f/(|e|^2 |f|^2), which is
 // exact for a closed fan on a sphere [Max 1999, Eq. 2].
@@ -158,8 +167,7 @@ Vector3d PNTriangles::edge_handle(const PatchShape& shape, int t, int from, int 
     const Vector3d& beyond =
         shape.normals[mesh_.group[other][mesh_.corner_of(other, mesh_.triangles[t][from])]];
     const Vector3d both = own.cross(beyond);
-    if (both.norm() > settings_.same_normal)
-      return p + chord.dot(both) / both.squaredNorm() * both / 3.0;
+    if (both.norm() > same_normal) return p + chord.dot(both) / both.squaredNorm() * both / 3.0;
   }
   return p + (chord - chord.dot(own) * own) / 3.0;
 }
@@ -190,7 +198,7 @@ std::optional<Projection> PNTriangles::projection(const PatchShape& shape, const
                                                   double side) const {
   int before = -1;
   for (int hop = 0; hop < hops_max; ++hop) {
-    const PNRoot root(patch(shape, t), p, settings_);
+    const PNRoot root(patch(shape, t), p);
     int out = 0;
     const double least = root.b.minCoeff(&out);
     if (root.found && least >= inside)
@@ -202,7 +210,7 @@ std::optional<Projection> PNTriangles::projection(const PatchShape& shape, const
       out = after_next(out);
     if (mesh_.sharp[t][out]) return foot_around(shape, p, t, side);
     const int beyond = mesh_.across[t][out];
-    if (beyond == before && root.found && least >= -settings_.between) {
+    if (beyond == before && root.found && least >= -between_triangles) {
       return Projection{t, root.b, root.point, side * root.normal, side * root.height, true};
     }
     before = std::exchange(t, beyond);
@@ -227,7 +235,7 @@ std::optional<Projection> PNTriangles::foot_around(const PatchShape& shape, cons
   };
   for (int q : some) {
     const PNPatch one = patch(shape, q);
-    const PNRoot root(one, p, settings_);
+    const PNRoot root(one, p);
     if (root.found && root.b.minCoeff() >= inside && side * root.height > 0.0) {
       take({q, root.b, root.point, side * root.normal, side * root.height, true});
     }

@@ -31,7 +31,6 @@
 #include <optional>
 #include <vector>
 
-#include "contact/settings.hpp"
 #include "math/buffer.hpp"
 
 namespace sim_core {
@@ -92,7 +91,7 @@ struct PNRoot {
   double height = 0.0;  // m
   bool found = false;
 
-  PNRoot(const PNPatch& patch, const Eigen::Vector3d& p, const SmoothSettings& settings);
+  PNRoot(const PNPatch& patch, const Eigen::Vector3d& p);
 };
 
 // Where a surface is: its nodes, and of the corners of its triangles the normals and the largest
@@ -118,7 +117,7 @@ class PNTriangles {
  public:
   // `crease`: see CreasedTriangles.
   PNTriangles(std::vector<std::array<int, 3>> triangles, const Buffer<double>& x,
-              const std::vector<double>& crease, const SmoothSettings& settings = {});
+              const std::vector<double>& crease);
 
   const std::vector<std::array<int, 3>>& triangles() const { return mesh_.triangles; }
   PatchShape shape(const Buffer<double>& x) const;
@@ -149,7 +148,6 @@ class PNTriangles {
                                         int triangle, double side) const;
 
   CreasedTriangles mesh_;
-  SmoothSettings settings_;
 };
 
 }  // namespace sim_core

@@ -5,6 +5,7 @@
 #include <limits>
 #include <utility>
 
+#include "contact/constants.hpp"
 #include "contact/rows.hpp"
 #include "contact/state.hpp"
 
@@ -35,14 +36,12 @@ bool began_near(const std::vector<Body>& bodies, const Vector3d& p, double dista
 SmoothContact::SmoothContact(std::vector<std::array<int, 3>> triangles,
                              std::vector<int> sheet_of_node, const ContactMaterials& materials,
                              const std::vector<double>& crease, const Buffer<double>& x,
-                             const std::vector<double>& radius, const SmoothSettings& settings)
+                             const std::vector<double>& radius)
     : sheet_of_node_(std::move(sheet_of_node)),
       radius_(radius),
       free_nodes_(static_cast<int>(radius.size())),
       materials_(materials),
-      settings_(settings),
-      patches_(triangles, x, creases(triangles, sheet_of_node_, materials.sheets, crease),
-               settings),
+      patches_(triangles, x, creases(triangles, sheet_of_node_, materials.sheets, crease)),
       tree_(patches_.triangles(), x),
       track_{std::vector<int>(radius.size(), -1), std::vector<double>(radius.size(), 1.0)},
       history_(track_),
@@ -92,13 +91,13 @@ void SmoothContact::begin(const Buffer<double>& start, const Buffer<double>& end
   for (int i = 0; i < free_nodes_; ++i) {
     const Vector3d p = at_node(start, i);
     const bool came = track_.triangle[i] == left_to_pairs,
-               near = began_near(at_start, p, settings_.body_first);
+               near = began_near(at_start, p, obstacles::corner);
     if (near) track_.triangle[i] = left_to_pairs;
     if (near || track_.triangle[i] >= 0 || sheet_of_node_[i] < 0) continue;
     const double kept =
-        thickness + 0.5 * settings_.curvature_max * radius_[i] + start_.bulge;  // at most
+        thickness + 0.5 * obstacles::curvature_max * radius_[i] + start_.bulge;  // at most
     const double reach =
-        kept + settings_.reach * ((at_node(guess, i) - p - common).norm() + spread + thickness);
+        kept + obstacles::reach * ((at_node(guess, i) - p - common).norm() + spread + thickness);
     const Nearest found = tree_.nearest(
         p, reach, [&](int t) { return materials_.mu(sheet_of_node_[i], surface_of(t)) >= 0.0; });
     track_.triangle[i] = found.triangle;
@@ -126,7 +125,7 @@ double SmoothContact::rest_distance(const PatchShape& shape, int node,
   const double r = radius_[node];
   const double curvature =
       patches_.curvature(shape, projection.triangle, projection.weights, track_.side[node]);
-  const double sinking = 0.5 * r * r * std::min(curvature, settings_.curvature_max / r);
+  const double sinking = 0.5 * r * r * std::min(curvature, obstacles::curvature_max / r);
   return std::max(materials_.mean(sheet, surface),
                   materials_.rest_distance(sheet, surface) + sinking);
 }

@@ -7,6 +7,7 @@
 #include <utility>
 
 #include "contact/capstan.hpp"
+#include "contact/constants.hpp"
 #include "contact/rows.hpp"
 
 namespace sim_core {
@@ -15,11 +16,16 @@ namespace {
 using Eigen::Matrix3d;
 using Eigen::Vector3d;
 
+// Cosine of the angle of two normals below which their faces are opposite: flat ones have a fillet
+// up to here.
+constexpr double opposite_cosine = -0.9;
+
 // Round faces make corners of less than 66 degrees smaller and none below 53, for cloth comes out
 // of the cusp under a box's edge; flat ones below 26 degrees.
-double fillet_radius(const Gap& a, const Gap& b, double fillet) {
+double fillet_radius(const Gap& a, const Gap& b) {
   const double c = a.normal.dot(b.normal);
-  return fillet * std::clamp(a.flat && b.flat ? 10.0 + 10.0 * c : 3.0 + 5.0 * c, 0.0, 1.0);
+  return obstacles::corner *
+         std::clamp(a.flat && b.flat ? 10.0 + 10.0 * c : 3.0 + 5.0 * c, 0.0, 1.0);
 }
 
 // Takes the fillet between three bodies, or two where the last two are one, for the contact if its
@@ -28,16 +34,15 @@ double fillet_radius(const Gap& a, const Gap& b, double fillet) {
 // With normals n_i as the rows of N, and a_i what gap i lacks of the fillet's radius, the least way
 // out to where all gaps are that radius is w = N^-1 a = N^T l, where all l are positive; of two
 // bodies, n_3 = n_1 x n_2 and a_3 = 0. The gap of the fillet is the radius less |w|.
-void lay_fillet(const std::array<const BodyContact*, 3>& bodies, double fillet, BodyContact& on) {
+void lay_fillet(const std::array<const BodyContact*, 3>& bodies, BodyContact& on) {
   constexpr double parallel = 1e-6;  // determinant of unit normals
   const Gap& first = bodies[0]->gap;
   const Gap& second = bodies[1]->gap;
   const Gap& third = bodies[2]->gap;
   const bool has_third = bodies[2] != bodies[1];
-  double radius = std::min(fillet_radius(first, second, fillet), fillet);
+  double radius = std::min(fillet_radius(first, second), obstacles::corner);
   if (has_third) {
-    radius = std::min(
-        {radius, fillet_radius(first, third, fillet), fillet_radius(second, third, fillet)});
+    radius = std::min({radius, fillet_radius(first, third), fillet_radius(second, third)});
   }
   Matrix3d normals;
   normals << first.normal, second.normal,
@@ -65,21 +70,20 @@ void ForceNorms::count(double force_squared) {
     largest = std::sqrt(force_squared);
 }
 
-ContactState::ContactState(int free_nodes, const ContactSettings& settings)
+ContactState::ContactState(int free_nodes)
     : mode(free_nodes, contact_open),
       touched(free_nodes, -1),
       sheet(free_nodes, 0),
       cell(free_nodes, 0.0),
+      thickness(free_nodes, 0.0),
+      area(free_nodes, 0.0),
       stiffness(free_nodes, 0.0),
       normal(4 * free_nodes + 64, 0.0f),
       direction(4 * free_nodes + 64, 0.0f),
       coupling(free_nodes, 0.0f),
       turning(free_nodes, 0.0f),
       force(4 * free_nodes + 64, 0.0f),
-      correction(4 * free_nodes + 64, 0.0f),
-      penalty_(settings.penalty),
-      turning_max_(settings.penalty / settings.law_stiffness),
-      fillet_(settings.fillet) {}
+      correction(4 * free_nodes + 64, 0.0f) {}
 
 ContactRows ContactState::rows() const {
   return {mode.data(), normal.data(), direction.data(), coupling.data(), turning.data()};
@@ -88,7 +92,7 @@ ContactRows ContactState::rows() const {
 void ContactState::penalty(int node, double own, float* out) const {
   std::fill(out, out + 6, 0.0f);
   if (mode[node] == contact_open) return;
-  const float k = static_cast<float>(penalty_) * static_cast<float>(own);
+  const float k = static_cast<float>(stiffness::factor) * static_cast<float>(own);
   const float* n = &normal[4L * node];
   const float* t = &direction[4L * node];
   const float side = mode[node] == contact_stick ? k : std::min(turning[node], k);
@@ -109,7 +113,7 @@ BodyContact ContactState::body_contact(const std::vector<Body>& bodies, const Ve
   for (std::size_t b = 0; b < bodies.size(); ++b) {
     BodyContact candidate{gap_of(bodies[b], p), static_cast<int>(b)};
     if (candidate.gap.distance < on.gap.distance) on = candidate;
-    if (!(candidate.gap.distance < 2.0 * fillet_)) continue;
+    if (!(candidate.gap.distance < 2.0 * obstacles::corner)) continue;
     for (int k = 0; k < count; ++k) {
       if (candidate.gap.distance < near[k].gap.distance) std::swap(candidate, near[k]);
     }
@@ -118,10 +122,33 @@ BodyContact ContactState::body_contact(const std::vector<Body>& bodies, const Ve
   // The fillets of each two bodies, and of each three.
   for (int k = 1; k < count; ++k) {
     for (int j = 1; j <= k; ++j) {
-      for (int i = 0; i < j; ++i) lay_fillet({&near[i], &near[j], &near[k]}, fillet_, on);
+      for (int i = 0; i < j; ++i) lay_fillet({&near[i], &near[j], &near[k]}, on);
     }
   }
   return on;
+}
+
+BodyContact ContactState::body_contact(const std::vector<Body>& bodies, const Vector3d& p,
+                                       int node) const {
+  BodyContact on = body_contact(bodies, p);
+  const double h = thickness[node];
+  if (on.body < 0 || on.others[0] >= 0 || !(on.gap.distance < h)) return on;
+  const Vector3d foot = p - on.gap.distance * on.gap.normal;
+  for (std::size_t b = 0; b < bodies.size(); ++b) {
+    if (static_cast<int>(b) == on.body) continue;
+    const Gap gap = gap_of(bodies[b], foot);
+    const bool faces = gap.normal.dot(on.gap.normal) < opposite_cosine;
+    if (!(faces && gap.distance < std::min(h, on.across.distance))) continue;
+    on.opposite = static_cast<int>(b);
+    on.across = gap;
+  }
+  return on;
+}
+
+Vector3d ContactState::press(const BodyContact& on, int node) const {
+  if (on.opposite < 0) return Vector3d::Zero();
+  const double closed = 1.0 - on.across.distance / thickness[node];
+  return compression * area[node] * closed * on.across.normal;
 }
 
 ForceNorms ContactState::classify_contacts(const Buffer<double>& x, const Buffer<double>& start,
@@ -132,17 +159,15 @@ ForceNorms ContactState::classify_contacts(const Buffer<double>& x, const Buffer
   const int free_nodes = static_cast<int>(mode.size());
   for (int i = 0; i < free_nodes; ++i) {
     const Vector3d p = at_node(x, i);
-    BodyContact on = body_contact(at_end, p);
-    const Vector3d r = at_node(residual, i);
-    const auto bears = [&] {
-      return on.body >= 0 && r.dot(on.gap.normal) - stiffness[i] * on.gap.distance > 0.0;
-    };
+    BodyContact on = body_contact(at_end, p, i);
     if (surfaces) {
       const std::optional<SmoothTouch> one = surfaces->touch(i, p);
       if (one && one->gap < on.gap.distance)
         on = {{one->gap, one->normal}, static_cast<int>(at_end.size()) + one->surface};
     }
-    if (!bears()) {
+    const Vector3d r = at_node(residual, i) - press(on, i);
+    const bool bears = on.body >= 0 && r.dot(on.gap.normal) - stiffness[i] * on.gap.distance > 0.0;
+    if (!bears) {
       touched[i] = -1;
       mode[i] = contact_open;
       at_node(force, i) = -r.cast<float>();
@@ -158,7 +183,7 @@ ForceNorms ContactState::classify_contacts(const Buffer<double>& x, const Buffer
                           at_node(direction, i).cast<double>().dot(law.direction) < 0.0;
     at_node(normal, i) = on.gap.normal.cast<float>();
     const LawResponse& chosen = stick_on_reversal && reversed ? sticking(contact) : law;
-    write(i, node_row(contact, chosen, turning_max_));
+    write(i, node_row(contact, chosen, stiffness::turning_max));
     norms.count(missed_squared(contact, law));
   }
   return norms;
@@ -183,7 +208,7 @@ bool ContactState::warm_start(const Buffer<double>& x, const Buffer<double>& sta
     if (history_.mode[i] == contact_open || body < 0) continue;
     BodyContact on;
     if (body < static_cast<int>(at_end.size())) {
-      on = body_contact(at_end, at_node(x, node));
+      on = body_contact(at_end, at_node(x, node), node);
       if (on.body != body) on = {gap_of(at_end[body], at_node(x, node)), body};
     } else {
       const std::optional<SmoothTouch> one = surfaces->touch(node, at_node(x, node));
@@ -207,8 +232,8 @@ bool ContactState::warm_start(const Buffer<double>& x, const Buffer<double>& sta
 
 Vector3d ContactState::slip(const BodyContact& on, const Vector3d& before, const Vector3d& p,
                             const std::vector<Body>& at_start, const std::vector<Body>& at_end) {
-  const Vector3d u =
-      on.mean([&](int b) -> Vector3d { return p - carried(at_start[b], at_end[b], before); });
+  const auto over = [&](int b) -> Vector3d { return p - carried(at_start[b], at_end[b], before); };
+  const Vector3d u = on.opposite < 0 ? on.mean(over) : 0.5 * (over(on.body) + over(on.opposite));
   return u - u.dot(on.gap.normal) * on.gap.normal;
 }
 
@@ -217,7 +242,8 @@ Contact ContactState::contact_at(int node, const BodyContact& on, const Buffer<d
                                  const std::vector<Body>& at_start,
                                  const std::vector<Body>& at_end) const {
   const Vector3d before = at_node(start, node), p = at_node(x, node), &n = on.gap.normal;
-  const Vector3d force = at_node(residual, node);
+  const Vector3d pressing = press(on, node);
+  const Vector3d force = at_node(residual, node) - pressing;
   if (on.body >= static_cast<int>(at_end.size())) {
     const Vector3d u = surfaces->slip(node, before, p);
     Contact out{on.gap.distance, n, u - u.dot(n) * n, force, surfaces->mu(node), stiffness[node]};
@@ -225,12 +251,15 @@ Contact ContactState::contact_at(int node, const BodyContact& on, const Buffer<d
                           [&](const Vector3d& near) { return surfaces->normal_near(node, near); });
     return out;
   }
-  const double mu_here = on.mean([&](int b) { return at_end[b].mu_of(sheet[node]); });
+  const auto mu_with = [&](int b) { return at_end[b].mu_of(sheet[node]); };
+  const double mu_here =
+      on.opposite < 0 ? on.mean(mu_with) : 0.5 * (mu_with(on.body) + mu_with(on.opposite));
   Contact out{on.gap.distance, n,       slip(on, before, p, at_start, at_end),
               force,           mu_here, stiffness[node]};
+  out.pressed = pressing.norm();
   // Planes are flat, and fillets hollow: there cloth does not turn at nodes.
   const Body& body = at_end[on.body];
-  if (body.shape != Body::plane && on.others[0] < 0) {
+  if (body.shape != Body::plane && on.others[0] < 0 && on.opposite < 0) {
     out.mu =
         corrected_mu(out, node, p, [&](const Vector3d& near) { return gap_of(body, near).normal; });
   }

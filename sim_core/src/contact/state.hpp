@@ -14,7 +14,6 @@
 #include "contact/linearized_contact.hpp"
 #include "contact/pn_triangles.hpp"
 #include "contact/rows.hpp"
-#include "contact/settings.hpp"
 #include "contact/surface.hpp"
 #include "math/buffer.hpp"
 
@@ -43,8 +42,7 @@ class SmoothContact {
   // largest triangle at each free node, m.
   SmoothContact(std::vector<std::array<int, 3>> triangles, std::vector<int> sheet_of_node,
                 const ContactMaterials& materials, const std::vector<double>& crease,
-                const Buffer<double>& x, const std::vector<double>& radius,
-                const SmoothSettings& settings);
+                const Buffer<double>& x, const std::vector<double>& radius);
 
   // Forgets which triangles are touched.
   void restart();
@@ -81,7 +79,6 @@ class SmoothContact {
   int free_nodes_;
   int first_ = std::numeric_limits<int>::max();  // of the surfaces' nodes, which are the last
   ContactMaterials materials_;
-  SmoothSettings settings_;
   PNTriangles patches_;
   TriangleTree tree_;
   PatchShape start_, end_;
@@ -100,12 +97,21 @@ struct ForceNorms {
   void count(double force_squared);
 };
 
+// Pressure that would close cloth between two bodies to nothing, Pa. Fabrics lose a quarter to a
+// third of their thickness at 5 kPa in the compression test of [Kawabata 1980].
+constexpr double compression = 2e4;
+
 // What a node sees of the bodies: the nearest, or, in a corner, the fillet between two or three.
+//
+// Cloth has a thickness h where it lies between two bodies that face each other. The opposite one,
+// at a distance d from the face of the nearest, presses on it by `compression` (1 - d/h).
 struct BodyContact {
   Gap gap;
   int body = -1;                      // -1: none
   std::array<int, 2> others{-1, -1};  // the same
   std::array<double, 2> share{};      // of the others in what bears
+  int opposite = -1;                  // -1: none
+  Gap across{std::numeric_limits<double>::infinity(), Eigen::Vector3d::Zero()};  // of the opposite
 
   template <class Of>
   auto mean(const Of& of) const {
@@ -118,12 +124,14 @@ struct BodyContact {
 
 class ContactState {
  public:
-  explicit ContactState(int free_nodes, const ContactSettings& settings = {});
+  explicit ContactState(int free_nodes);
 
   std::vector<int> mode,
       touched;  // (free nodes): ContactMode, and the body, or after them the surface (-1: none)
   std::vector<int> sheet;         // (free nodes): to which they belong
   std::vector<double> cell;       // (free nodes): side of a cell, m
+  std::vector<double> thickness;  // (free nodes): of the cloth, m
+  std::vector<double> area;       // (free nodes): of the cloth, m^2
   std::vector<double> stiffness;  // (free nodes): k of the law, N/m
   Buffer<float> normal, direction, coupling, turning;
   Buffer<float> force,
@@ -137,6 +145,11 @@ class ContactState {
   bool stick_on_reversal = false;
 
   BodyContact body_contact(const std::vector<Body>& bodies, const Eigen::Vector3d& p) const;
+  // The same of a node of cloth with a thickness: with the body on its other side, if any is near.
+  BodyContact body_contact(const std::vector<Body>& bodies, const Eigen::Vector3d& p,
+                           int node) const;
+  // Force of the opposite body on a node, without friction, N.
+  Eigen::Vector3d press(const BodyContact& on, int node) const;
   // Way over the bodies of a node that was at `before` when the step began, in the plane of
   // contact, m.
   static Eigen::Vector3d slip(const BodyContact& on, const Eigen::Vector3d& before,
@@ -183,7 +196,6 @@ class ContactState {
     double dt = 0.0;  // 0: nothing is kept
   };
   History history_;
-  double penalty_, turning_max_, fillet_;
 };
 
 }  // namespace sim_core

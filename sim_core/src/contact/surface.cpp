@@ -85,8 +85,8 @@ const Matrix3d& Turns::of(const Surface& surface, int node) {
   here.turn /= end - begin;
   if (node < free_nodes_) {
     const double angle = std::sqrt(std::max(3.0 - here.turn.trace(), 0.0));
-    here.turn = Matrix3d::Identity() +
-                std::clamp(2.0 - angle / turn_max_, 0.0, 1.0) * (here.turn - Matrix3d::Identity());
+    here.turn = Matrix3d::Identity() + std::clamp(2.0 - angle / pairs::turn_max, 0.0, 1.0) *
+                                           (here.turn - Matrix3d::Identity());
   }
   return here.turn;
 }

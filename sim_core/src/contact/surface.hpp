@@ -8,6 +8,7 @@
 #include <vector>
 
 #include "contact/closest.hpp"
+#include "contact/constants.hpp"
 #include "math/buffer.hpp"
 
 namespace sim_core {
@@ -22,13 +23,12 @@ struct ContactMaterials {
   // the earlier sheet's vertices: the active set is not unique and changes all the time. With less
   // than 1 they are active where cloth is curved only.
   double edge_share = 1.0, second_share = 1.0;
-  double surface_share = 0.25;  // what pairs with surfaces keep of it: see ContactSettings
 
   double mean(int a, int b) const { return 0.5 * (thickness[a] + thickness[b]); }
   // Distance that pairs of closest points keep, m. Nodes touch surfaces by themselves
   // (contact/state.hpp): pairs only hold what comes nearer between the nodes.
   double rest_distance(int a, int b) const {
-    return (std::max(a, b) < sheets ? 1.0 : surface_share) * mean(a, b);
+    return (std::max(a, b) < sheets ? 1.0 : pairs::surface_fraction) * mean(a, b);
   }
   // The same by kind of pair; `first` and `second`: sheets of its pieces.
   double rest_distance(PairKind kind, int first, int second) const {
@@ -87,9 +87,6 @@ struct Surface {
 // where motion ends. Turns of free nodes that are large fade out.
 class Turns {
  public:
-  // `turn_max`: angle up to which the turn of a free node counts, rad; from twice that it does not.
-  explicit Turns(double turn_max) : turn_max_(turn_max) {}
-
   // A step begins at `start` and is expected to end at `expected`. The nodes behind the free ones
   // go there surely.
   void begin(const Buffer<double>& start, const Buffer<double>& expected, int free_nodes);
@@ -102,7 +99,6 @@ class Turns {
     int step = 0;  // to which it belongs
     Eigen::Matrix3d turn;
   };
-  double turn_max_;
   std::vector<Turn> triangles_, nodes_;
   Buffer<double> start_, expected_;
   int step_ = 0, free_nodes_ = 0;

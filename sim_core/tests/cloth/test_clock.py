@@ -182,7 +182,8 @@ def test_what_happens_after_the_last_frame_is_not_judged(
         frames=48,
         frame_rate=100.0,
     ).run()
-    assert run.times[-1] == 0.47
+    # A run that has jumped may end before its last frame.
+    assert stop <= run.times[-1] <= 0.47
     assert run.code == code
 
 

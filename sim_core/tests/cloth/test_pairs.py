@@ -2,8 +2,8 @@
 bear.
 
 The lowest corner of an upright sheet, which is held, presses on a corner of a level sheet, which is
-free and lies below it. All other vertices are held. Most tests let a step end after one iteration,
-by wide tolerances: the forces then show what the solver assumes before it iterates.
+free and lies below it. All other vertices are held. Most tests let a step end after one iteration:
+the forces then show what the solver assumes before it iterates.
 """
 
 from dataclasses import replace
@@ -19,13 +19,7 @@ Floats = NDArray[np.float64]
 
 CERTIFIED = preset_named("certified")
 ONE_ITERATION = replace(
-    CERTIFIED,
-    name="one-iteration",
-    constants={
-        "contact.length_tolerance": 1.0,
-        "newton.linear_share": 1e-12,
-        "newton.cuts_max": 1.0,
-    },
+    CERTIFIED, name="one-iteration", newton_max=1, newton_before_halving=1, halvings_max=0
 )
 H = 1e-3
 """Thickness [m]."""
@@ -58,7 +52,6 @@ def corners(
         preset,
         held=HELD,
         self_contact=SelfContact(mu, H),
-        force_scale=1e4 if preset is ONE_ITERATION else None,
     )
     cloth.gravity[:] = 0.0
     cloth.set_state(places(inward, height))
@@ -67,7 +60,7 @@ def corners(
 
 def force_after(cloth: Cloth, inward: float, height: float) -> Floats:
     """Move the upper corner in a step; return the force of pairs on the free corner (3,) [N]."""
-    assert cloth.step(0.02, held=places(inward, height)[HELD], damping=5.0).converged
+    cloth.step(0.02, held=places(inward, height)[HELD], damping=5.0)
     pairs = cloth.pair_forces
     force: Floats = (pairs.weights * (pairs.vertices == CORNER)).sum(axis=1) @ pairs.forces
     return force

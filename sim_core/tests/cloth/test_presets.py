@@ -12,9 +12,18 @@ CERTIFIED = preset_named("certified")
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"patience": -3}, r"patience: must be an integer, 1 \.\.\. 1000, got -3"),
-        ({"patience": 1001}, r"patience: must be an integer, 1 \.\.\. 1000, got 1001"),
-        ({"patience": 10.5}, r"patience: must be an integer, 1 \.\.\. 1000, got 10.5"),
+        (
+            {"newton_before_halving": -3},
+            r"newton_before_halving: must be an integer, 1 \.\.\. 1000, got -3",
+        ),
+        (
+            {"newton_before_halving": 1001},
+            r"newton_before_halving: must be an integer, 1 \.\.\. 1000, got 1001",
+        ),
+        (
+            {"newton_before_halving": 10.5},
+            r"newton_before_halving: must be an integer, 1 \.\.\. 1000, got 10.5",
+        ),
         ({"newton_max": 0}, r"newton_max: must be an integer, 1 \.\.\. 1000, got 0"),
         ({"halvings_max": 21}, r"halvings_max: must be an integer, 0 \.\.\. 20, got 21"),
         ({"refactor_after": -1}, r"refactor_after: must be an integer, 0 \.\.\. 10000, got -1"),

@@ -115,8 +115,7 @@ NB_MODULE(_testing, m) {
          const StretchTable& stretching, const Eigen::Matrix3d& rigidity, const Points3& x,
          const Points3& v) {
         const ClothMesh mesh(rest, triangles);
-        FactorSettings exact;  // no fold is too small, and none is old
-        exact.fold_smallest = exact.stiffening_change = 0.0;
+        const MatrixApproximation exact{0.0, 0.0};  // no fold is too small, and none is old
         Assembly assembly(kernel_level("").cloth, mesh,
                           Fabrics(mesh, {{density, stretching, rigidity, 0.0}}), {}, 0, exact);
         const std::vector<int>& node = assembly.numbering.node;

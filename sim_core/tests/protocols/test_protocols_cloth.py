@@ -107,7 +107,7 @@ class TestLateralBuckling:
         % lighter.
         """
         clamped = strip(0.02, 20, "alternating")
-        gamma = share * lateral_buckling.threshold(clamped, 0.0, CERTIFIED)
+        gamma = share * lateral_buckling.threshold(clamped, 0.0, CERTIFIED)[0]
         cloth, flat = lateral_buckling.loaded(
             clamped, 0.0, 0.2 * GRAVITY * LENGTH**3 / gamma, CERTIFIED
         )
@@ -181,16 +181,20 @@ class TestInclinedPlane:
 
 
 class TestMotion:
-    @pytest.mark.parametrize("name", ["fall", "slide-to-rest"])
+    @pytest.mark.parametrize("name", ["fall", "slide-to-rest", "impact"])
     @pytest.mark.parametrize("preset", ["fast", "certified"])
     def test_passes(self, name: str, preset: str) -> None:
         result = protocols.run(name, preset)
         assert result.passed
         assert result.settings["unconverged_steps"] == 0
 
-    @pytest.mark.parametrize("name", ["fall", "slide-to-rest"])
-    def test_fails_for_a_wrong_gravity(self, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(motion, "GRAVITY", 1.005 * GRAVITY)
+    @pytest.mark.parametrize(
+        ("name", "factor"), [("fall", 1.005), ("slide-to-rest", 1.005), ("impact", 1.02)]
+    )
+    def test_fails_for_a_wrong_gravity(
+        self, name: str, factor: float, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(motion, "GRAVITY", factor * GRAVITY)
         assert not protocols.run(name).passed
 
 
@@ -201,12 +205,14 @@ class TestPresets:
         always = {
             "fall",
             "slide-to-rest",
+            "impact",
+            "gripper",
             "stick-slip",
             "cantilever",
             "lateral-buckling",
             "inclined-plane",
         }
-        contact = {"capstan", "heavy-fold", "stacked-incline", "pull-out"}
+        contact = {"capstan", "edge", "heavy-fold", "stacked-incline", "pull-out"}
         assert set(certification.protocols) == (
             always if preset.startswith("thesis-") else always | contact
         )

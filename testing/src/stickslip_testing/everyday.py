@@ -210,19 +210,21 @@ def _on_incline(cells: int, mu: float) -> tuple[str, float]:
 
 def slides_down(cells: int) -> str:
     """At mu 0.2 it accelerates by g (sin - mu cos) within 5 %."""
-    code, found = _on_incline(cells, 0.2)
+    code, acceleration = _on_incline(cells, 0.2)
     expected = GRAVITY * (0.5 - 0.2 * np.cos(np.pi / 6))
     return code or (
         "right"
-        if abs(found / expected - 1.0) < 0.05
-        else f"wrong: {found:.3g} m/s^2, not {expected:.3g}"
+        if abs(acceleration / expected - 1.0) < 0.05
+        else f"wrong: {acceleration:.3g} m/s^2, not {expected:.3g}"
     )
 
 
 def sticks(cells: int) -> str:
     """At mu 0.7 nothing slides."""
-    code, found = _on_incline(cells, 0.7)
-    return code or ("right" if abs(found) < 1e-3 else f"wrong: slides with {found:.3g} m/s^2")
+    code, acceleration = _on_incline(cells, 0.7)
+    return code or (
+        "right" if abs(acceleration) < 1e-3 else f"wrong: slides with {acceleration:.3g} m/s^2"
+    )
 
 
 def slides_into_corner(cells: int) -> str:
@@ -320,8 +322,8 @@ def squeezed(cells: int) -> str:
 
 EVERYDAY: Mapping[str, tuple[Callable[[int], str], tuple[str, ...]]] = MappingProxyType(
     {
-        made.__name__: (made, allowed)
-        for made, allowed in (
+        make_scene.__name__: (make_scene, allowed)
+        for make_scene, allowed in (
             (napkin_on_floor, ("right",)),
             (rod_of_a_cell, ("right",)),
             (ball_of_a_cell, ("right",)),

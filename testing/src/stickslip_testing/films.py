@@ -56,8 +56,8 @@ def write_film(
 
     matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
     columns, rows = np.meshgrid(np.arange(float(camera.width)), np.arange(float(camera.height)))
-    seen = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2)
-    flat = cv2.undistortPoints(seen, matrix, np.array(distortion), P=matrix).reshape(
+    pixels = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2)
+    flat = cv2.undistortPoints(pixels, matrix, np.array(distortion), P=matrix).reshape(
         camera.height, camera.width, 2
     )
     with av.open(str(path), "w") as container:
@@ -67,7 +67,7 @@ def write_film(
         stream.options = {"crf": str(quality)}
         for picture, off in zip(pictures, shake, strict=True):
             across, down = np.moveaxis((flat - off).astype(np.float32), -1, 0)
-            shown = cv2.remap(np.asarray(picture, np.float32), across, down, cv2.INTER_CUBIC)
-            levels = np.round(np.clip(shown, 0, 255)).astype(np.uint8)
+            distorted = cv2.remap(np.asarray(picture, np.float32), across, down, cv2.INTER_CUBIC)
+            levels = np.round(np.clip(distorted, 0, 255)).astype(np.uint8)
             container.mux(stream.encode(av.VideoFrame.from_ndarray(levels, format="rgb24")))
         container.mux(stream.encode())

@@ -46,12 +46,12 @@ _INITIAL = (
 
 def find_programs() -> Path | None:
     """Return the directory of PostgreSQL's programs, None if they are not installed."""
-    found = [Path(path).parent for path in (shutil.which("initdb"),) if path]
+    folders = [Path(path).parent for path in (shutil.which("initdb"),) if path]
     versions = sorted(
         Path("/usr/lib/postgresql").glob("*/bin/initdb"), key=lambda path: int(path.parts[4])
     )
-    found += [path.parent for path in reversed(versions)]
-    return next((path for path in found if (path / "postgres").exists()), None)
+    folders += [path.parent for path in reversed(versions)]
+    return next((path for path in folders if (path / "postgres").exists()), None)
 
 
 class PostgresqlServer:

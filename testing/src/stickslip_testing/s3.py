@@ -40,7 +40,7 @@ class Proxy:
     one_by_one: threading.Lock = field(default_factory=threading.Lock)
     """Held while the server answers a conditional request."""
 
-    def some(self, seed: int, shares: dict[str, float]) -> None:
+    def inject_faults(self, seed: int, shares: dict[str, float]) -> None:
         """Let faults happen at random, each to its share of the requests."""
         dice, lock = random.Random(seed), threading.Lock()
 

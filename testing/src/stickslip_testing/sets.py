@@ -18,7 +18,7 @@ def frozen(
     """
     task = TASKS[reader.kind]
     slots = reader.slots(split)
-    seen = task.seen(reader, slots)
+    control_values = task.control_values(reader, slots)
     new = NamedSet(
         name,
         about,
@@ -26,7 +26,7 @@ def frozen(
         labels_digest(task, reader, slots),
         split,
         (reader.manifest_digest,),
-        seen,
+        control_values,
     )
     new.check(reader)
     document = {
@@ -37,5 +37,5 @@ def frozen(
         "spec": spec,
     }
     packed = BytesIO()
-    np.savez_compressed(packed, **seen)  # type: ignore[arg-type]  # its stub takes no dictionary
+    np.savez_compressed(packed, **control_values)  # type: ignore[arg-type]  # its stub takes no dictionary
     return (json.dumps(document, indent=2) + "\n").encode(), packed.getvalue()

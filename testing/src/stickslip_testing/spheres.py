@@ -25,9 +25,9 @@ def icosphere(subdivisions: int) -> tuple[NDArray[np.float64], NDArray[np.int32]
     )
     for _ in range(subdivisions):
         edges = np.sort(triangles[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2), axis=1)
-        unique, which = np.unique(edges, axis=0, return_inverse=True)
+        unique, edge_of_side = np.unique(edges, axis=0, return_inverse=True)
         a, b, c = triangles.T
-        x, y, z = which.reshape(-1, 3).T + len(vertices)
+        x, y, z = edge_of_side.reshape(-1, 3).T + len(vertices)
         vertices = np.concatenate([vertices, vertices[unique].mean(axis=1)])
         triangles = np.concatenate(
             [np.stack(corner, axis=1) for corner in ((a, z, y), (z, b, x), (y, x, c), (x, y, z))]

@@ -63,16 +63,18 @@ class Watched:
 def watch(tumble: Tumble, steps: int | None = None) -> Watched:
     """Run a tumble, or its first steps, and look for crossings after each of them."""
     cloth, crossing, seconds = tumble.cloth, 0, 0.0
-    own = np.asarray(cloth.mesh.triangles)
+    triangles_of_cloth = np.asarray(cloth.mesh.triangles)
     for step in range(1, (tumble.steps if steps is None else steps) + 1):
         begin = time.process_time()
         cloth.step(STEP, held=tumble.held(step * STEP), bodies=tumble.bodies)
         seconds += time.process_time() - begin
         at = cloth.positions
-        crossed = crossings(at, own, at, own)
+        crossed = crossings(at, triangles_of_cloth, at, triangles_of_cloth)
         for surface in cloth.surfaces:
-            others, triangles = surface.at(cloth.time), np.asarray(surface.triangles)
-            crossed += crossings(at, own, others, triangles) + crossings(others, triangles, at, own)
+            vertices, triangles = surface.at(cloth.time), np.asarray(surface.triangles)
+            crossed += crossings(at, triangles_of_cloth, vertices, triangles) + crossings(
+                vertices, triangles, at, triangles_of_cloth
+            )
         crossing += crossed > 0
     least = cloth.total.least_distance / THICKNESS
     return Watched(
@@ -119,7 +121,7 @@ def balance(cloth: Cloth) -> Balance:
 
 
 def crossings(
-    positions: Floats, triangles: NDArray[np.int32], others: Floats, cut: NDArray[np.int32]
+    positions: Floats, triangles: NDArray[np.int32], vertices: Floats, cut: NDArray[np.int32]
 ) -> int:
     """Count the edges of `triangles` that cross a triangle of `cut`.
 
@@ -131,22 +133,25 @@ def crossings(
     Args:
         positions: (N, 3) [m]
         triangles: (T, 3)
-        others: (M, 3) [m]: `positions` itself where cloth is compared with itself.
+        vertices: (M, 3) [m]: `positions` itself where cloth is compared with itself.
         cut: (U, 3)
     """
     edges = np.unique(np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)), axis=0)
     p, q = positions[edges[:, 0]], positions[edges[:, 1]]
-    corners = others[cut]
+    corners = vertices[cut]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     above, below = (end @ normal.T - (corners[:, 0] * normal).sum(axis=1) for end in (p, q))
     pairs = np.argwhere((np.minimum(np.abs(above), np.abs(below)) > FLAT) & (above * below < 0.0))
-    if others is positions:
+    if vertices is positions:
         pairs = pairs[~(edges[pairs[:, 0], :, None] == cut[pairs[:, 1], None, :]).any(axis=(1, 2))]
     start, along = p[pairs[:, 0]], (q - p)[pairs[:, 0]]
     a, b, c = np.moveaxis(corners[pairs[:, 1]] - start[:, None], 1, 0)
     sides = np.stack(
-        [(along * np.cross(one, two)).sum(axis=1) for one, two in ((a, b), (b, c), (c, a))]
+        [
+            (along * np.cross(edge, next_edge)).sum(axis=1)
+            for edge, next_edge in ((a, b), (b, c), (c, a))
+        ]
     )
     return int((np.abs(np.sign(sides).sum(axis=0)) == 3).sum())
 
@@ -302,8 +307,8 @@ def _free(_: float) -> Floats:
 
 TUMBLES: Mapping[str, Callable[[SolverSettings], Tumble]] = MappingProxyType(
     {
-        f"{made.__name__}-{seed}": partial(made, seed)
-        for made, seeds in (
+        f"{make_tumble.__name__}-{seed}": partial(make_tumble, seed)
+        for make_tumble, seeds in (
             (drop, range(8)),
             (folding, range(3)),
             (crumple, range(4)),

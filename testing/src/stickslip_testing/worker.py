@@ -112,7 +112,7 @@ class PretendWorker:
     slots: int = 2
     judge: Callable[[Any], TaskResult | None] = lambda _task: None
     id: str = ""
-    ran: list[str] = field(default_factory=list)
+    finished_ids: list[str] = field(default_factory=list)
     whole: bool = False
     """Whether its datasets have all arrays of their kind, or only `views` and `sample_key`."""
     record: Mapping[str, Any] = field(default_factory=dict)
@@ -168,7 +168,7 @@ class PretendWorker:
 
     def finish(self, *leases: Lease) -> list[str]:
         """Run tasks and report their results; return the verdicts."""
-        self.ran += [lease.task_id for lease in leases]
+        self.finished_ids += [lease.task_id for lease in leases]
         return self.report(*((lease, self.result(lease.task)) for lease in leases))
 
     def work(self, rounds: int = 1000) -> int:
@@ -241,22 +241,24 @@ class PretendWorker:
         )
 
     def _publish(self, task: PublishTask) -> PublishOutput:
-        given = [
+        sections_of_task = [
             PublishSection.model_validate_json(self.store.read(digest)) for digest in task.sections
         ]
         count = task.spec.sample_count
         zarr = {file.path: file for file in self._zarr(count)}
         group = self.store.read(zarr.pop(GROUP_NAME).sha256)
-        own = [*zarr.values(), *self._label_files(task, given)]
-        listed = [file for section in given for file in section.files]
-        rejections = tuple(rejection for section in given for rejection in section.rejections)
+        own_files = [*zarr.values(), *self._label_files(task, sections_of_task)]
+        listed = [file for section in sections_of_task for file in section.files]
+        rejections = tuple(
+            rejection for section in sections_of_task for rejection in section.rejections
+        )
         sections: list[FileEntry] = []
         if has_sections(task.spec):
-            for number, section in enumerate(given):
-                kept = ManifestSection(
+            for number, section in enumerate(sections_of_task):
+                section_document = ManifestSection(
                     **{name: getattr(section, name) for name in ManifestSection.model_fields}
                 )
-                data = kept.model_dump_json().encode()
+                data = section_document.model_dump_json().encode()
                 path = section_path(number)
                 sections.append(
                     FileEntry(path=path, sha256=self.store.publish(data), size=len(data))
@@ -277,15 +279,17 @@ class PretendWorker:
             rejections=() if sections else rejections,
             sample_keys=()
             if sections
-            else tuple(key for section in given for key in section.sample_keys),
-            files=tuple(sorted(own if sections else [*own, *listed], key=lambda file: file.path)),
+            else tuple(key for section in sections_of_task for key in section.sample_keys),
+            files=tuple(
+                sorted(own_files if sections else [*own_files, *listed], key=lambda file: file.path)
+            ),
         )
         content = manifest.model_dump_json().encode()
         digest = self.store.publish(content)
         group_digest = self.store.publish(with_manifest_digest(group, digest))
         seal = self.store.publish(seal_text(digest, group_digest))
         named = {MANIFEST_NAME: digest, GROUP_NAME: group_digest, SEAL_NAME: seal}
-        every = [*own, *listed, *sections]
+        every = [*own_files, *listed, *sections]
         for path, artifact in (named | {file.path: file.sha256 for file in every}).items():
             self.store.show(artifact, task.dataset, task.version, path)
         return PublishOutput(
@@ -293,13 +297,13 @@ class PretendWorker:
         )
 
     def _label_files(
-        self, task: PublishTask, given: Sequence[PublishSection]
+        self, task: PublishTask, sections_of_task: Sequence[PublishSection]
     ) -> Iterator[FileEntry]:
         """Yield the files of the labels of the packed shards: all labels, or only `sample_key`."""
         labels = [array for array in layout(task.spec) if array.is_label]
         labels = labels if self.whole else [array for array in labels if array.name == "sample_key"]
         columns: dict[str, list[bytes]] = {array.name: [] for array in labels}
-        for digest in (digest for section in given for digest in section.labels):
+        for digest in (digest for section in sections_of_task for digest in section.labels):
             data = self.store.read(digest)
             for array, (offset, length) in zip(
                 labels, decode_shard_index(data, len(labels)).tolist(), strict=True
@@ -351,13 +355,13 @@ def _encoded(array: ArrayLayout, task: PackTask, record: Mapping[str, Any]) -> b
     values = [
         np.asarray(
             (ramp + slot.slot) % 251
-            if own is None
-            else array.categories.index(own)
+            if code is None
+            else array.categories.index(code)
             if array.categories
-            else own,
+            else code,
             array.dtype,
         )
-        for slot, own in zip(task.slots, known, strict=True)
+        for slot, code in zip(task.slots, known, strict=True)
         if slot.valid or of_axis
     ]
     if array.name == "sample_key":

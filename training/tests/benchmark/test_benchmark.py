@@ -34,9 +34,9 @@ def add_set(folder, name, dataset, split="test"):
         "kind": dataset.spec.kind
     }
     with DatasetReader(dataset.root) as reader:
-        document, seen = frozen(name, "a set to test with", spec, split, reader)
+        document, control_values = frozen(name, "a set to test with", spec, split, reader)
     (folder / f"{name}.json").write_bytes(document)
-    (folder / f"{name}.npz").write_bytes(seen)
+    (folder / f"{name}.npz").write_bytes(control_values)
 
 
 @pytest.fixture
@@ -87,8 +87,10 @@ def test_the_labels_of_a_committed_set_follow_from_its_spec(name):
     always = {"lighting": "drawn"} if chosen.spec["kind"] == "cloth_drag" else {}
     labels = [{"slot": sample.slot, **sample.labels, **always} for sample in planned]
     assert sha256(canonical_json(labels).encode()) == chosen.labels
-    assert set(chosen.seen) == set(chosen.task.tolerances)
-    assert all(len(values) in (len(planned), len(NOISES)) for values in chosen.seen.values())
+    assert set(chosen.control_values) == set(chosen.task.tolerances)
+    assert all(
+        len(values) in (len(planned), len(NOISES)) for values in chosen.control_values.values()
+    )
     assert len(chosen.published[0]) == 64
 
 

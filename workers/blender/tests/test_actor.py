@@ -33,6 +33,7 @@ from stickslip_schemas.spec.cameras import Camera, rig_digest
 from stickslip_schemas.spec.jobs import Quality
 from stickslip_schemas.spec.names import Texture
 from stickslip_schemas.store import CorruptArtifactError, DirectoryStore
+from stickslip_testing.render_tasks import rod_task
 
 DOCUMENTS = tuple(
     f"stickslip_schemas/{name}.py" for name in ("kinds/cloth/spec", "spec/jobs", "spec/names")
@@ -59,22 +60,6 @@ def actor(store: DirectoryStore) -> Iterator[RenderActor]:
     return RenderActor(str(store.root))
 
 
-def _task(record: str, *, row: int = 0, preview: bool = False, **look: Any) -> dict[str, Any]:
-    render = {
-        "kind": "rod_hang",
-        "rig": "rod-4",
-        "rig_digest": rig_digest("rod-4"),
-        "quality": "draft",
-        "color_seed": 5,
-    }
-    return {
-        "stage": "render",
-        "render": render | look,
-        "record": {"digest": record, "row": row},
-        "preview": preview,
-    }
-
-
 def _files(store: DirectoryStore) -> set[str]:
     return {path.name for path in store.root.rglob("*") if path.is_file()}
 
@@ -86,7 +71,7 @@ def test_a_rod_becomes_a_chunk_and_a_preview(
     curl: npt.NDArray[np.float64],
     rig: tuple[Camera, ...],
 ) -> None:
-    result = TaskResult.model_validate(actor.render(_task(record, preview=True)))
+    result = TaskResult.model_validate(actor.render(rod_task(record, preview=True)))
     assert result.outcome == "succeeded"
     assert isinstance(result.output, RenderOutput)
     assert result.output.labels == {"color": list(to_linear(silicone_color(5)))}
@@ -109,10 +94,10 @@ def test_a_rod_becomes_a_chunk_and_a_preview(
 def test_two_actors_give_the_same_digests(
     actor: RenderActor, store: DirectoryStore, record: str
 ) -> None:
-    first = actor.render(_task(record))
+    first = actor.render(rod_task(record))
     before = _files(store)
     other = RenderActor(str(store.root))
-    second = other.render(_task(record))
+    second = other.render(rod_task(record))
     assert second["output"] == first["output"]
     assert _files(store) == before
 
@@ -120,7 +105,8 @@ def test_two_actors_give_the_same_digests(
 def test_radius_and_seed_matter(actor: RenderActor, record: str) -> None:
     looks: list[dict[str, Any]] = [{}, {"radius": 0.01}, {"color_seed": 6}, {"quality": "standard"}]
     chunks = [
-        actor.render(_task(record, **look))["output"]["chunks"]["views"]["digest"] for look in looks
+        actor.render(rod_task(record, **look))["output"]["chunks"]["views"]["digest"]
+        for look in looks
     ]
     assert len(set(chunks)) == 4
 
@@ -129,7 +115,7 @@ def test_a_rod_that_leaves_the_frame_is_rejected_with_the_view(
     actor: RenderActor, store: DirectoryStore, record: str
 ) -> None:
     before = _files(store)
-    result = TaskResult.model_validate(actor.render(_task(record, row=1)))
+    result = TaskResult.model_validate(actor.render(rod_task(record, row=1)))
     assert result.outcome == "rejected"
     assert result.reason is Reason.out_of_frame
     assert "the rod leaves view front by 14.7 px; " in result.message
@@ -137,7 +123,7 @@ def test_a_rod_that_leaves_the_frame_is_rejected_with_the_view(
 
 
 def test_a_centreline_of_nan_is_rejected(actor: RenderActor, record: str) -> None:
-    result = TaskResult.model_validate(actor.render(_task(record, row=2)))
+    result = TaskResult.model_validate(actor.render(rod_task(record, row=2)))
     assert result.outcome == "rejected"
     assert result.reason is Reason.invalid_sample
 
@@ -146,18 +132,18 @@ def test_what_is_not_the_samples_fault_is_raised(
     actor: RenderActor, store: DirectoryStore, record: str
 ) -> None:
     with pytest.raises(FileNotFoundError):
-        actor.render(_task("0" * 64))
+        actor.render(rod_task("0" * 64))
     with pytest.raises(ValueError, match=r"record\.row must be below 3"):
-        actor.render(_task(record, row=3))
+        actor.render(rod_task(record, row=3))
     with pytest.raises(ValueError, match=r"render\.rig_digest must be that of rod-4"):
-        actor.render(_task(record, rig_digest="0" * 64))
+        actor.render(rod_task(record, rig_digest="0" * 64))
     with pytest.raises(ValueError, match="rig must be one of"):
-        actor.render(_task(record, rig="rod-5"))
+        actor.render(rod_task(record, rig="rod-5"))
     with pytest.raises(ValidationError):
-        actor.render(_task(record, radius=-1.0))
+        actor.render(rod_task(record, radius=-1.0))
     store.path(record).write_bytes(b"not what its name says")
     with pytest.raises(CorruptArtifactError):
-        RenderActor(str(store.root)).render(_task(record))
+        RenderActor(str(store.root)).render(rod_task(record))
 
 
 _CRASH = """
@@ -176,7 +162,7 @@ def test_a_crash_of_blender_leaves_everything_as_it_was(
     temporary = tmp_path / "temporary"
     temporary.mkdir()
     done = subprocess.run(
-        [sys.executable, "-c", _CRASH, str(store.root), json.dumps(_task(record))],
+        [sys.executable, "-c", _CRASH, str(store.root), json.dumps(rod_task(record))],
         capture_output=True,
         check=False,
         env=os.environ | {"TMPDIR": str(temporary)},
@@ -184,7 +170,7 @@ def test_a_crash_of_blender_leaves_everything_as_it_was(
     assert done.returncode == -signal.SIGKILL
     assert _files(store) == before
     assert list(temporary.iterdir()) == []
-    assert actor.render(_task(record))["outcome"] == "succeeded"
+    assert actor.render(rod_task(record))["outcome"] == "succeeded"
 
 
 def test_an_actor_says_which_build_it_is(actor: RenderActor, tmp_path: Path) -> None:
@@ -286,7 +272,7 @@ def test_every_function_that_renders_is_in_the_build(
     """
     cloth = trajectory()
     tasks = {
-        "rod_hang": (_task(record), _task(record)),
+        "rod_hang": (rod_task(record), rod_task(record)),
         "cloth_drag": (_clip(cloth, frames=1), _clip(cloth, frames=1, light_seed=10)),
     }
     for kind, (first, task) in tasks.items():
@@ -411,7 +397,7 @@ def test_rods_and_cloths_take_turns(
         )
     )
     assert built == ["ClothScene"]  # built once for all looks of a mesh
-    rod = actor.render(_task(record))
+    rod = actor.render(rod_task(record))
     again = actor.render(_clip(cloth, frames=1))
     assert built == ["ClothScene", "RodRenderer", "ClothScene"]  # Blender is one scene per process
     another = actor.render(_clip(cloth, frames=1, light_seed=2))

@@ -1,4 +1,4 @@
-"""Command line: `python -m stickslip_workers dispatch | head | replay | certify | describe`."""
+"""Command line: `python -m stickslip_workers`, with the commands that `_parser` has."""
 
 import argparse
 import ctypes
@@ -71,6 +71,10 @@ def _parser() -> argparse.ArgumentParser:
     preview.add_argument("scene", type=Path, help="the scene as JSON")
     preview.add_argument("--out", type=Path, required=True, help="directory for the pictures")
     preview.set_defaults(run=_preview)
+
+    lab = commands.add_parser("lab", help="test a fabric, as `stickslip lab` hands it over")
+    lab.add_argument("request", type=Path, help="the test, the fabric and options as JSON")
+    lab.set_defaults(run=_lab)
 
     describe = commands.add_parser("describe", help="print the builds of this environment")
     describe.set_defaults(run=_describe)
@@ -294,6 +298,19 @@ def _certify(options: argparse.Namespace) -> int:
         return 2
     sys.stdout.write(certificate.digest + "\n")
     return 0 if certificate.passed else 1
+
+
+def _lab(options: argparse.Namespace) -> int:
+    """Return 0 if the fabric was tested, and 2 if not."""
+    from stickslip_workers.laboratory import run_test
+
+    try:
+        answer = run_test(json.loads(options.request.read_text(encoding="utf-8")))
+    except (ValueError, OSError) as error:
+        sys.stderr.write(f"error: {error}\n")
+        return 2
+    sys.stdout.write(json.dumps(answer) + "\n")
+    return 0
 
 
 def _preview(options: argparse.Namespace) -> int:

@@ -5,8 +5,10 @@ not have stickslip_workers, so this module may not import any part of the projec
 """
 
 import importlib
+import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
+from pathlib import Path
 from typing import Any
 
 FRAMES_SECONDS = 2.0
@@ -32,9 +34,10 @@ def run(
 ) -> Iterator[Any]:
     """Yield the messages of a call: its node, perhaps its progress, and its answers.
 
-    The first message is a dict: the node, whether the builds of the process are `foreign`, and
-    whether the process is `cold`. Progress is a tuple (frames done, frames in total). The last
-    message is the list of answers. A call on foreign builds ends after the first message.
+    The first message is a dict: the node, whether the builds of the process are `foreign`, whether
+    the process is `cold`, and its `log`: the file of its errors, and the size of that file now.
+    Progress is a tuple (frames done, frames in total). The last message is the list of answers. A
+    call on foreign builds ends after the first message.
 
     `factory` (`module:Class`) makes an object that stays in the process for later calls.
     """
@@ -51,7 +54,7 @@ def run(
         _used.add(factory)
     node = ray.get_runtime_context().get_node_id()
     is_foreign = process_builds != builds
-    yield {"node": node, "foreign": is_foreign, "cold": is_cold}
+    yield {"node": node, "foreign": is_foreign, "cold": is_cold, "log": _log()}
     if is_foreign:
         return
 
@@ -68,3 +71,14 @@ def run(
         if frames is not None:
             yield tuple(frames)
     yield answers.result()
+
+
+def _log() -> tuple[str, int]:
+    """Return the file that this process writes its errors to, and its size [bytes].
+
+    The name is empty where nobody can tell.
+    """
+    try:
+        return str(Path("/proc/self/fd/2").readlink()), os.fstat(2).st_size
+    except OSError:
+        return "", 0

@@ -101,7 +101,7 @@ def _field_error(item: ErrorDetails, document: Any, expected: Any) -> FieldError
     return FieldError(
         pointer="".join("/" + _pointer_token(part) for part in written),
         rule=rule,
-        value="" if is_missing else _shown(value),
+        value="" if is_missing else _short_repr(value),
     )
 
 
@@ -110,7 +110,7 @@ def _pointer_token(part: int | str) -> str:
     return str(part).replace("~", "~0").replace("/", "~1")
 
 
-def _shown(value: Any) -> str:
+def _short_repr(value: Any) -> str:
     # Values that JSON does not have are named by their type: nobody wants to read a Python repr.
     text = json.dumps(_beginning(value, [SHOWN_LETTERS]), default=lambda item: type(item).__name__)
     return text if len(text) <= SHOWN_LETTERS else text[: SHOWN_LETTERS - 3] + "..."

@@ -234,7 +234,7 @@ class Contents:
     `read` raises.
     """
 
-    KEPT = 2
+    CACHED_SECTIONS = 2
     """Number of sections in memory: the last that were read."""
 
     def __init__(self, manifest: Manifest, read: Callable[[FileEntry], bytes]) -> None:
@@ -244,7 +244,7 @@ class Contents:
             section_samples(manifest.spec) if manifest.sections else manifest.sample_count
         )
         # `lru_cache` is safe for threads. At most two sections are in memory, each of some MB.
-        self.section = lru_cache(self.KEPT)(self._section)
+        self.section = lru_cache(self.CACHED_SECTIONS)(self._section)
         self._files_of = lru_cache(1)(
             lambda number: {file.path: file for file in self.section(number).files}
         )

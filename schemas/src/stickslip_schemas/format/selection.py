@@ -163,16 +163,18 @@ def part_files(contents: Contents, selection: Selection, label: Labels | None) -
                     np.unique(slots // manifest.spec.samples_per_file(array)).tolist(),
                 )
             )
-    found = [
+    selected_files = [
         file
         for file in manifest.files
         if file.path in paths or file.path.split("/")[0] not in names
     ]
     if manifest.sections and label is not None:
         for number in sections_of(contents, selection, label):
-            found.append(manifest.sections[number])
-            found += [file for file in contents.section(number).files if file.path in paths]
-    return found
+            selected_files.append(manifest.sections[number])
+            selected_files += [
+                file for file in contents.section(number).files if file.path in paths
+            ]
+    return selected_files
 
 
 def sections_of(contents: Contents, selection: Selection, label: Labels) -> list[int]:

@@ -6,7 +6,7 @@ The rig `drag` films it.
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from stickslip_schemas.base import Document, Float, Int, Sha256, Stage
 from stickslip_schemas.kinds.cloth.arrays import (
@@ -16,6 +16,7 @@ from stickslip_schemas.kinds.cloth.arrays import (
     over_time,
     solver_arrays,
 )
+from stickslip_schemas.kinds.cloth.fabric_axes import with_drawn_material
 from stickslip_schemas.kinds.cloth.spec import (
     VIEWPOINT,
     ClipRender,
@@ -38,8 +39,9 @@ from stickslip_schemas.spec.axes import (
     quantity,
 )
 from stickslip_schemas.spec.cameras import Camera, load_rig, rig_cameras, rig_digest
+from stickslip_schemas.spec.fabrics import FABRIC_SHORTHAND, FabricNumbers
 from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, Costs, PresetName, SeedRule, Simulation
-from stickslip_schemas.spec.names import CustomName, FabricNumbers, Material, name_schema
+from stickslip_schemas.spec.names import CustomName, Material, name_schema
 
 RIG = "drag"
 """The cameras; their names are also the names of the viewpoints."""
@@ -72,7 +74,8 @@ FactorAxis = Annotated[
     SHORTHAND,
 ]
 MaterialAxis = Annotated[
-    ListAxis[Annotated[CustomName, quantity("Material"), name_schema(Material)]], SHORTHAND
+    ListAxis[Annotated[CustomName, quantity("Material"), name_schema(Material)]],
+    FABRIC_SHORTHAND,
 ]
 ViewpointAxis = Annotated[
     ListAxis[Annotated[CustomName, quantity("Viewpoint"), name_schema(VIEWPOINTS)]],
@@ -86,7 +89,8 @@ class ClothDragAxes(Document):
 
     # The physics first, then the looks: the last axis varies fastest, and looks share simulations.
     material: MaterialAxis = Field(
-        description="a measured fabric, or a custom one under `materials`"
+        description="a measured fabric, a custom one under `materials` or in `fabrics/`, or a "
+        "distribution that draws many"
     )
     mu: MuAxis = Field(description="friction coefficient between cloth and floor")
     density: FactorAxis | None = Field(
@@ -199,6 +203,22 @@ class ClothDragSpec(ClipSpec):
         },
     )
 
+    @model_validator(mode="before")
+    @classmethod
+    def _draw_fabrics(cls, document: Any) -> Any:
+        return with_drawn_material(document)
+
+    def key_value(self, axis: str, value: Any) -> Any:
+        card = self.materials.get(value) if axis == "material" else None
+        return value if card is None else card.identity
+
+    def document_fields(self, axis: str, value: Any) -> dict[str, Any]:
+        if axis != "material":
+            return super().document_fields(axis, value)
+        card = self.materials.get(value)
+        numbers = None if card is None else card.numbers()
+        return {"material": self.key_value(axis, value), "fabric": numbers}
+
     @property
     def certified_preset(self) -> str:
         return self.preset.value
@@ -228,7 +248,9 @@ class ClothDragSpec(ClipSpec):
         # A clip costs about the same, whatever it shows.
         if stage is Stage.render:
             return super().cost_group(stage, point)
-        group = f"{point['material']}, mu {point['mu']:.1g}, mesh {self.mesh}, {self.preset}"
+        card = self.materials.get(point["material"])
+        fabric = point["material"] if card is None else card.size_words
+        group = f"{fabric}, mu {point['mu']:.1g}, mesh {self.mesh}, {self.preset}"
         return group if self.self_friction is None else f"{group}, self-contact"
 
     def simulation_settings(self) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
 from stickslip_schemas.base import Document, Sha256, Stage, artifact_digest
+from stickslip_schemas.kinds.cloth import fabric_axes
 from stickslip_schemas.kinds.cloth.arrays import (
     clip_arrays,
     parameter_label,
@@ -191,6 +192,11 @@ class ClothSceneSpec(ClipSpec):
     )
     axes: ClothSceneAxes
 
+    @model_validator(mode="before")
+    @classmethod
+    def _draw_fabrics(cls, document: Any) -> Any:
+        return fabric_axes.with_drawn_parameters(document)
+
     @field_validator("set")
     @classmethod
     def _can_be_set(
@@ -272,6 +278,10 @@ class ClothSceneSpec(ClipSpec):
             fields[name] = tuple("/".join(map(str, ("scene", *steps))) for steps in locations)
         return fields
 
+    @cached_property
+    def _sheets_of_fabrics(self) -> dict[str, tuple[str, ...]]:
+        return fabric_axes.sheets_of_fabrics(self.stage)
+
     @property
     def named_axes(self) -> dict[str, AnyAxis]:
         """The axes by name: all parameters of the scene, then looks.
@@ -307,11 +317,15 @@ class ClothSceneSpec(ClipSpec):
         return self._parameter_fields.get(axis) or super().fields_of(axis)
 
     def document_fields(self, axis: str, value: Any) -> dict[str, Any]:
-        return (
-            dict.fromkeys(self._parameter_fields[axis], value)
-            if axis in self._parameter_fields
-            else super().document_fields(axis, value)
-        )
+        if axis not in self._parameter_fields:
+            return super().document_fields(axis, value)
+        if axis not in self._sheets_of_fabrics:
+            return dict.fromkeys(self._parameter_fields[axis], value)
+        return fabric_axes.fabric_fields(self.stage, self._sheets_of_fabrics[axis], value)
+
+    def key_value(self, axis: str, value: Any) -> Any:
+        card = self.stage.materials.get(value) if axis in self._sheets_of_fabrics else None
+        return value if card is None else card.identity
 
     def seed_axes(self, rule: SeedRule) -> tuple[str, ...]:
         """Return the axes whose values enter a seed.
@@ -324,11 +338,14 @@ class ClothSceneSpec(ClipSpec):
         return tuple(axis for axis in self.named_axes if axis not in left_out)
 
     def simulation_settings(self) -> dict[str, Any]:
-        return {"scene": self.stage.physics()}
+        return {"scene": self.stage.with_slots(self.stage.physics())}
 
     def render_settings(self) -> dict[str, Any] | None:
         looks = self.stage.looks
-        settings = {**(super().render_settings() or {}), "scene": self.stage.staged()}
+        settings = {
+            **(super().render_settings() or {}),
+            "scene": self.stage.with_slots(self.stage.staged()),
+        }
         # Cameras, light and floor are names, or numbers of the scene.
         if isinstance(looks.cameras, str):
             settings["rig"] = looks.cameras
@@ -424,11 +441,9 @@ class ClothSceneSpec(ClipSpec):
         """
         if stage is Stage.render:
             return f"{super().cost_group(stage, point)}, {self._cost_of_scene}"
-        words = [self._cost_of_scene]
-        for name in self._parameter_fields:
-            value = point.get(name)
-            words.append(f"{value:.1g}" if isinstance(value, float) else str(value))
-        return ", ".join(words)
+        names = self._parameter_fields
+        words = (fabric_axes.cost_words(self.stage, point.get(name)) for name in names)
+        return ", ".join((self._cost_of_scene, *words))
 
     def arrays(self) -> tuple[ArrayLayout, ...]:
         # With zipped axes, a parameter without an axis has no label.

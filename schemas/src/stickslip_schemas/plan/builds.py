@@ -54,7 +54,7 @@ class Builds(Document):
 UNCOUNTED = ("stickslip_schemas.kinds", "stickslip_schemas.store", "stickslip_schemas.store.*")
 """Modules that no build counts."""
 
-OURS = "stickslip_"
+PREFIX = "stickslip_"
 """Prefix of the names of our packages."""
 
 
@@ -139,8 +139,8 @@ def _imports(path: Path) -> Iterator[str]:
     for node in _import_nodes(_parse(path)):
         if isinstance(node, ast.Import):
             # An import of whole modules.
-            yield from (alias.name for alias in node.names if alias.name.startswith(OURS))
-        elif (node.module or "").startswith(OURS):
+            yield from (alias.name for alias in node.names if alias.name.startswith(PREFIX))
+        elif (node.module or "").startswith(PREFIX):
             # An import of names: each may be a module, or passed on from another one.
             for alias in node.names:
                 yield _defining_module(str(node.module), alias.name)
@@ -164,7 +164,7 @@ def _defining_module(module: str, name: str) -> str:
     if _is_submodule(path.parent, name):
         return f"{module}.{name}"
     for node in _import_nodes(_parse(path)):
-        if not isinstance(node, ast.ImportFrom) or not (node.module or "").startswith(OURS):
+        if not isinstance(node, ast.ImportFrom) or not (node.module or "").startswith(PREFIX):
             continue
         for alias in node.names:
             if (alias.asname or alias.name) == name:

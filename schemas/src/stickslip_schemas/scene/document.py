@@ -35,13 +35,16 @@ from stickslip_schemas.scene.parts import (
     Vector,
     unit_hint,
 )
+from stickslip_schemas.spec.fabrics import FabricNumbers
 from stickslip_schemas.spec.jobs import PresetName
-from stickslip_schemas.spec.names import CustomName, FabricNumbers, Material, Texture, did_you_mean
+from stickslip_schemas.spec.names import CustomName, Material, Texture, did_you_mean
 
 MAX_FRAMES = 10_000
 """Of a scene."""
 MAX_VERTICES = 100_000
 """Of all sheets of a scene."""
+MAX_MATERIALS = 256
+"""Most custom fabrics of a scene."""
 MAX_DOCUMENT_BYTES = 64 * 2**10
 """Of the document of a scene, as JSON."""
 MAX_TRACK = 2**31 // 12
@@ -104,8 +107,10 @@ class Physics(Document):
         ),
     )
     preset: PresetName = Field(default=PresetName.certified, description="named solver settings")
-    materials: Annotated[dict[CustomName, FabricNumbers], BY_NAME] = Field(
-        default_factory=dict, max_length=64
+    materials: Annotated[dict[CustomName, FabricNumbers | None], BY_NAME] = Field(
+        default_factory=dict,
+        max_length=MAX_MATERIALS,
+        description="custom fabrics; null, in documents of samples, where a fabric is built in",
     )
     sheets: Annotated[dict[CustomName, Sheet], BY_NAME] = Field(min_length=1, max_length=64)
     bodies: Annotated[dict[CustomName, Body], BY_NAME] = Field(default_factory=dict, max_length=64)
@@ -309,6 +314,13 @@ class Staged(Physics):
 class Scene(Staged):
     """A scene: its physics, its parameters and its looks."""
 
+    @model_validator(mode="after")
+    def _cards_are_there(self) -> Self:
+        for name, card in self.materials.items():
+            if card is None:
+                refuse(self, ("materials", name), "must be the card of a fabric", None)
+        return self
+
     name: CustomName | None = Field(default=None, description="of the scene, for people")
     description: str = Field(default="", max_length=2000, description="for people")
     parameters: Annotated[dict[ParameterName, Parameter], BY_NAME] = Field(
@@ -323,11 +335,51 @@ class Scene(Staged):
 
     def staged(self) -> dict[str, Any]:
         """Return the part of the document, as JSON, that pictures depend on."""
-        return self.model_dump(mode="json", include=set(Staged.model_fields))
+        return self._numbers_of(Staged)
 
     def physics(self) -> dict[str, Any]:
         """Return the part of the document, as JSON, that a trajectory depends on."""
-        return self.model_dump(mode="json", include=set(Physics.model_fields))
+        return self._numbers_of(Physics)
+
+    def _numbers_of(self, part: type[Physics]) -> dict[str, Any]:
+        document = self.model_dump(mode="json", include=set(part.model_fields))
+        # The sources of cards are for people.
+        for card in document["materials"].values():
+            card.pop("source", None)
+        return document
+
+    @property
+    def has_slots(self) -> bool:
+        """True if documents of samples can name fabrics by their sheets: see `with_slots`.
+
+        A parameter that sets a number of a card needs the card under its name.
+        """
+        sets = [self.locations(name) for name in self.parameters]
+        sets_cards = any(place[0] == "materials" for places in sets for place in places)
+        return bool(self.materials) and not sets_cards
+
+    def with_slots(self, document: dict[str, Any]) -> dict[str, Any]:
+        """Return a part of the document in which fabrics have no names of the user.
+
+        Content keys then follow the numbers of the fabrics that are there, and no others.
+        """
+        if not self.has_slots:
+            return document
+        slots: dict[str, Any] = {}
+        sheets: dict[str, Any] = {}
+        for name, sheet in document["sheets"].items():
+            material, slots[self.slot(name)] = self.slotted(name, sheet["material"])
+            sheets[name] = {**sheet, "material": material}
+        return {**document, "materials": slots, "sheets": sheets}
+
+    def slot(self, sheet: str) -> str:
+        """Return the name of the fabric of a sheet in documents of samples."""
+        return f"of-sheet-{list(self.sheets).index(sheet)}"
+
+    def slotted(self, sheet: str, material: str) -> tuple[str, dict[str, Any] | None]:
+        """Return the name and the numbers of a fabric of a sheet; None if it is built in."""
+        card = self.materials.get(material)
+        return (material, None) if card is None else (self.slot(sheet), card.numbers())
 
     def locations(self, parameter: str) -> tuple[Location, ...]:
         """Return the locations in the document that a parameter sets."""

@@ -213,10 +213,10 @@ def _check_sewn(rest: Floats, positions: Floats) -> None:
     They are not welded: lists of held vertices and files of starts count them.
     """
     same = weld(np.column_stack([rest, positions]))
-    repeated = len(rest) - len(same.kept)
+    repeated = len(rest) - len(same.vertices)
     if repeated:
-        again = int(np.setdiff1d(np.arange(len(rest)), same.kept)[0])
-        first = int(same.kept[same.targets[again]])
+        again = int(np.setdiff1d(np.arange(len(rest)), same.vertices)[0])
+        first = int(same.vertices[same.targets[again]])
         raise UnfitFileError(
             "neighbouring triangles must share their vertices, or the sheet falls apart; "
             f"{repeated} of {len(rest)} vertices are at the position of another one, such as "
@@ -271,12 +271,12 @@ def _weld_body(arrays: Arrays) -> _Body:
         columns = positions.transpose(1, 0, 2).reshape(positions.shape[1], -1)
     same = weld(columns.astype(np.float64))
     count = len(columns)
-    welded_count = count - len(same.kept)
+    welded_count = count - len(same.vertices)
     if welded_count:
         arrays = dict(arrays)
         for name, axis in (("rest", 0), ("weights", 0), ("positions", 1)):
             if name in arrays:
-                arrays[name] = np.take(arrays[name], same.kept, axis=axis)
+                arrays[name] = np.take(arrays[name], same.vertices, axis=axis)
         arrays["triangles"] = same.targets[arrays["triangles"]]
     return _Body(arrays, count, welded_count)
 

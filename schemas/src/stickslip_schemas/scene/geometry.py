@@ -86,14 +86,14 @@ class Touch:
     """[m]"""
 
 
-def are_apart(one: TriangleMesh, other: TriangleMesh, reach: float) -> bool:
+def are_apart(first: TriangleMesh, second: TriangleMesh, reach: float) -> bool:
     """Return True if a plane along either mesh parts both by more than `reach` [m].
 
     Many sheets over each other are done with so. False says nothing.
     """
-    for axis in (one.thin_axis, other.thin_axis):
-        places_one, places_other = one.vertices @ axis, other.vertices @ axis
-        gaps = (places_one.min() - places_other.max(), places_other.min() - places_one.max())
+    for axis in (first.thin_axis, second.thin_axis):
+        places_first, places_second = first.vertices @ axis, second.vertices @ axis
+        gaps = (places_first.min() - places_second.max(), places_second.min() - places_first.max())
         if max(gaps) > reach:
             return True
     return False
@@ -103,15 +103,15 @@ def are_apart(one: TriangleMesh, other: TriangleMesh, reach: float) -> bool:
 
 
 def find_crossing(
-    one: TriangleMesh, other: TriangleMesh, workload: Workload, *, batches: int | None = None
+    first: TriangleMesh, second: TriangleMesh, workload: Workload, *, batches: int | None = None
 ) -> Crossing | None:
     """Return two triangles of two meshes that cross; None if none do.
 
     `batches` ends the search after so many batches of candidates, where another fault is known.
     Raises TooManyPairsError.
     """
-    for i, j in islice(overlapping_boxes(one.tree, other.tree, workload), batches):
-        crossing = _first_crossing(one, other, i, j)
+    for i, j in islice(overlapping_boxes(first.tree, second.tree, workload), batches):
+        crossing = _first_crossing(first, second, i, j)
         if crossing is not None:
             return crossing
     return None
@@ -126,9 +126,9 @@ def find_self_crossing(mesh: TriangleMesh, workload: Workload) -> Crossing | Non
     for i, j in overlapping_boxes(mesh.tree, mesh.tree, workload):
         # Neighbours meet at the vertices that they share, which is no crossing.
         shares = np.zeros(len(i), dtype=bool)
-        for one in vertices:
-            for other in vertices:
-                shares |= one[i] == other[j]
+        for first in vertices:
+            for second in vertices:
+                shares |= first[i] == second[j]
         i, j = i[~shares], j[~shares]
         crossing = _first_crossing(mesh, mesh, np.minimum(i, j), np.maximum(i, j))
         if crossing is not None:
@@ -137,38 +137,38 @@ def find_self_crossing(mesh: TriangleMesh, workload: Workload) -> Crossing | Non
 
 
 def _first_crossing(
-    one: TriangleMesh, other: TriangleMesh, i: Integers, j: Integers
+    first: TriangleMesh, second: TriangleMesh, i: Integers, j: Integers
 ) -> Crossing | None:
     """Return the first of pairs of triangles, i of one mesh and j of another, that cross."""
     # Most neighbours lie on one side of the other's plane, and are done with here.
-    reaches = _reaches_plane(one, i, other, j)
+    reaches = _reaches_plane(first, i, second, j)
     i, j = i[reaches], j[reaches]
-    reaches = _reaches_plane(other, j, one, i)
+    reaches = _reaches_plane(second, j, first, i)
     i, j = i[reaches], j[reaches]
-    crosses = _cross(one.corners[i], other.corners[j])
+    crosses = _cross(first.corners[i], second.corners[j])
     if not crosses.any():
         return None
     number = int(np.argmax(crosses))
-    x, y, z = one.corners[i[number]].mean(axis=0).tolist()
+    x, y, z = first.corners[i[number]].mean(axis=0).tolist()
     return Crossing(int(i[number]), int(j[number]), (x, y, z))
 
 
 def _reaches_plane(
-    one: TriangleMesh, i: Integers, other: TriangleMesh, j: Integers
+    first: TriangleMesh, i: Integers, second: TriangleMesh, j: Integers
 ) -> npt.NDArray[np.bool_]:
     """Return whether triangles i of a mesh may have corners on both sides of planes j: (N,)."""
-    normals, offsets = other.planes
-    heights = np.einsum("nij,nj->ni", one.corners[i], normals[j]) - offsets[j][:, None]
+    normals, offsets = second.planes
+    heights = np.einsum("nij,nj->ni", first.corners[i], normals[j]) - offsets[j][:, None]
     a, b, c = heights.T
     lowest = np.minimum(np.minimum(a, b), c)
     highest = np.maximum(np.maximum(a, b), c)
     return np.asarray((lowest <= PLANE_SLACK) & (highest >= -PLANE_SLACK))
 
 
-def _cross(one: Floats, other: Floats) -> npt.NDArray[np.bool_]:
+def _cross(first: Floats, second: Floats) -> npt.NDArray[np.bool_]:
     """Return whether an edge of either triangle pierces the other: (N,), of corners (N, 3, 3)."""
-    pierces = np.zeros(len(one), dtype=bool)
-    for triangles, cutters in ((one, other), (other, one)):
+    pierces = np.zeros(len(first), dtype=bool)
+    for triangles, cutters in ((first, second), (second, first)):
         sides = _sides(cutters, triangles)
         straddling = np.flatnonzero((sides.min(axis=1) < 0.0) & (sides.max(axis=1) > 0.0))
         for corner in range(3):
@@ -214,20 +214,20 @@ def _cross_product(a: Floats, b: Floats) -> Floats:
 
 
 def find_touch(
-    one: TriangleMesh, other: TriangleMesh, reach: float, workload: Workload
+    first: TriangleMesh, second: TriangleMesh, reach: float, workload: Workload
 ) -> Touch | None:
     """Return a vertex of a mesh that is nearer to a triangle of another one than `reach` [m].
 
     None if none is. Raises TooManyPairsError.
     """
-    normals, offsets = other.planes
-    trees = (one.tree_of_vertices, other.tree)
+    normals, offsets = second.planes
+    trees = (first.tree_of_vertices, second.tree)
     for i, j in overlapping_boxes(*trees, workload, reach=reach):
         # A triangle is no nearer than its plane.
-        heights = np.abs(_dot(one.vertices[i], normals[j]) - offsets[j])
+        heights = np.abs(_dot(first.vertices[i], normals[j]) - offsets[j])
         is_near = heights < reach + PLANE_SLACK
         i, j = i[is_near], j[is_near]
-        distances = _distances(one.vertices[i], other.corners[j])
+        distances = _distances(first.vertices[i], second.corners[j])
         touches = distances < reach
         if touches.any():
             number = int(np.argmax(touches))

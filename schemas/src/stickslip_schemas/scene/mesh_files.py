@@ -234,9 +234,9 @@ def _line_number(text: bytes, line: re.Match[bytes]) -> int:
 
 def _refuse_line(text: bytes, line: re.Match[bytes], error: ValueError) -> NoReturn:
     number = _line_number(text, line)
-    shown = line[0].decode("utf-8", "replace").strip()[:80]
+    text_of_line = line[0].decode("utf-8", "replace").strip()[:80]
     rule = f"must be a vertex within {FARTHEST:g} m or a face of its vertices"
-    raise UnfitFileError(f"line {number} {rule}, and is {shown!r}") from error
+    raise UnfitFileError(f"line {number} {rule}, and is {text_of_line!r}") from error
 
 
 def _numbers(words: list[bytes], count: int) -> list[float]:
@@ -303,8 +303,8 @@ def _read_text_stl(data: bytes) -> Polygons:
         positions = np.array(vertices, dtype=np.float32).astype(np.float64).reshape(-1, 3)
     except ValueError as error:
         word = next(word for row in vertices for word in row if not _is_number(word))
-        shown = word.decode("utf-8", "replace")[:80]
-        rule = f"vertices of an STL file must be three numbers, and one has {shown!r}"
+        text_of_word = word.decode("utf-8", "replace")[:80]
+        rule = f"vertices of an STL file must be three numbers, and one has {text_of_word!r}"
         raise UnfitFileError(rule) from error
     facets = len(re.findall(rb"\bendfacet\b", data, re.IGNORECASE))
     if len(positions) != 3 * facets:

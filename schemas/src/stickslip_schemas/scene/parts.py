@@ -21,7 +21,7 @@ from stickslip_schemas.spec.names import (
     Substrate,
     did_you_mean,
 )
-from stickslip_schemas.spec.resolution import DEFAULT_RESOLUTION
+from stickslip_schemas.spec.resolution import DEFAULT_RESOLUTION, Resolution
 
 SMALLEST = 1e-3
 """Least extent of a sheet or of a mesh [m]: anything smaller is taken for another unit."""
@@ -477,6 +477,13 @@ class View(Document):
         le=400,
         description="for a film whose shorter side is 36 mm [mm]",
     )
+    # Without it, a scene has the digest that it had before.
+    resolution: Resolution | None = Field(
+        default=None,
+        exclude_if=lambda size: size is None,
+        description="width and height of the pictures of this camera [px], 64 to 1,920 each; by "
+        "default the `resolution` of the spec",
+    )
 
     @model_validator(mode="after")
     def _sees(self) -> Self:
@@ -502,15 +509,19 @@ class View(Document):
         return x, y, z
 
     def camera(self, name: str, resolution: tuple[int, int] = DEFAULT_RESOLUTION) -> Camera:
-        """Return the calibrated camera: upright, with the principal point in the middle."""
+        """Return the calibrated camera: upright, with the principal point in the middle.
+
+        The resolution of this camera goes before the given one.
+        """
         # Rows of the rotation are the axes of the camera: right, which is level, down and forward.
         x, y, z = (value / math.hypot(*self._forward) for value in self._forward)
         level = math.hypot(x, y)
         rotation = ((y / level, -x / level, 0.0), (x * z / level, y * z / level, -level), (x, y, z))
         # t = -R p, for the camera itself is at the origin of its axes.
         a, b, c = (0.0 - sum(map(mul, row, self.position)) for row in rotation)
-        focal = self.focal_length / FILM * min(resolution)
-        return central(name, resolution, focal, rotation, (a, b, c))
+        size = self.resolution or resolution
+        focal = self.focal_length / FILM * min(size)
+        return central(name, size, focal, rotation, (a, b, c))
 
 
 class SheetLook(Document):

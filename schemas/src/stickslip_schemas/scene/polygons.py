@@ -30,7 +30,7 @@ _FLAT = 1e-9
 class Weld(NamedTuple):
     """Vertices at equal positions made one."""
 
-    kept: Indices
+    vertices: Indices
     """(M,): the first vertex at each position, ascending."""
     targets: Indices
     """(N,): the new number of each vertex."""
@@ -172,9 +172,9 @@ def _cut_ears(polygon: Floats, face: int) -> Indices:
         for position in range(len(remaining)):
             ear = [remaining[position - 1], remaining[position]]
             ear.append(remaining[(position + 1) % len(remaining)])
-            others = [corner for corner in remaining if corner not in ear]
+            corners = [corner for corner in remaining if corner not in ear]
             # An ear is a triangle inside of the polygon: turned like it, with no corner in it.
-            if _area(flat[ear]) > _FLAT * area and not _contains(flat[ear], flat[others]).any():
+            if _area(flat[ear]) > _FLAT * area and not _contains(flat[ear], flat[corners]).any():
                 triangles.append(ear)
                 del remaining[position]
                 break

@@ -128,8 +128,8 @@ def _crowded_faults(
 
 def _sheet_faults(document: Mapping[str, Any], sheets: list[SheetStart]) -> Iterator[StartFault]:
     for sheet in sheets:
-        given = document["sheets"][sheet.name]
-        member = "file" if given["mesh"]["type"] == "file" else "size"
+        values = document["sheets"][sheet.name]
+        member = "file" if values["mesh"]["type"] == "file" else "size"
         location = ("sheets", sheet.name, "mesh", member)
         if sheet.pieces > 1:
             rule = (
@@ -138,15 +138,15 @@ def _sheet_faults(document: Mapping[str, Any], sheets: list[SheetStart]) -> Iter
             )
             yield StartFault(location, rule, sheet.pieces)
         # A sheet that passes through itself is nowhere too near to itself.
-        if given["self_contact"] and sheet.least_height <= given["thickness"]:
+        if values["self_contact"] and sheet.least_height <= values["thickness"]:
             rule = (
                 f"must have triangles that are higher than the sheet is thick, which is "
-                f"{given['thickness']:g} m: give lengths in metres, fewer cells, or a smaller "
+                f"{values['thickness']:g} m: give lengths in metres, fewer cells, or a smaller "
                 "thickness"
             )
             yield StartFault(location, rule, sheet.least_height)
         ratio = _size_ratio(sheet)
-        if given["start"]["type"] == "file" and not 1.0 / MAX_SIZE_RATIO < ratio < MAX_SIZE_RATIO:
+        if values["start"]["type"] == "file" and not 1.0 / MAX_SIZE_RATIO < ratio < MAX_SIZE_RATIO:
             rule = (
                 "must have edges about as long as in the flat pattern, and they are "
                 f"{ratio:.3g} times as long: give both in metres (texture coordinates of most "
@@ -176,21 +176,21 @@ def _size_ratio(sheet: SheetStart) -> float:
 
 def _holder_faults(document: Mapping[str, Any], sheets: list[SheetStart]) -> Iterator[StartFault]:
     for sheet in sheets:
-        taken = np.zeros(len(sheet.rest), dtype=bool)
+        held_before = np.zeros(len(sheet.rest), dtype=bool)
         holders = document["sheets"][sheet.name]["holders"]
         for key, holder in sorted(holders.items()):
             location: Location = ("sheets", sheet.name, "holders", key)
             held = held_vertices(sheet, holder, margin=-sheet.jitter)
             if not held_vertices(sheet, holder, margin=sheet.jitter).any():
                 yield StartFault(location, _beside(sheet, holder), _area_of(holder))
-            elif (held & taken).any():
-                vertex = int(np.argmax(held & taken))
+            elif (held & held_before).any():
+                vertex = int(np.argmax(held & held_before))
                 rule = f"must not hold vertex {vertex}, which another holder holds; move it aside"
                 yield StartFault(location, rule, _area_of(holder))
-            taken |= held
+            held_before |= held
         # What is let go becomes free, so only holders that always hold leave nothing to simulate.
         always = all(holder["grasp"] is None for holder in holders.values())
-        if taken.all() and always and len(sheets) == 1:
+        if held_before.all() and always and len(sheets) == 1:
             rule = "must leave a vertex free, and all are held; hold a smaller area"
             yield StartFault(("sheets", sheet.name, "holders"), rule, sorted(holders))
 
@@ -311,9 +311,9 @@ def _contact_faults(
                 )
                 location = ("sheets", sheet.name, "start")
                 yield StartFault(location, rule, document["sheets"][sheet.name]["start"]["type"])
-        others = [(f"sheet {other.name}", other.mesh) for other in standing[:number]]
-        others += [(f"body {name}", mesh) for name, mesh in surfaces]
-        for name, mesh in others:
+        obstacles = [(f"sheet {other.name}", other.mesh) for other in standing[:number]]
+        obstacles += [(f"body {name}", mesh) for name, mesh in surfaces]
+        for name, mesh in obstacles:
             rule = _meeting(sheet, name, mesh, workload)
             if rule:
                 location = ("sheets", sheet.name, "origin")

@@ -102,7 +102,8 @@ class SobolAxis(_RangeAxis[T], Generic[T]):
     type: Literal["sobol"]
 
 
-def _long_form(value: Any) -> Any:
+def long_form(value: Any) -> Any:
+    """Return an axis in its long form: a value and a list become a list with its type."""
     # The short forms: a list, and one value.
     if isinstance(value, list | tuple):
         return {"type": "list", "values": value}
@@ -117,7 +118,7 @@ def _long_form(value: Any) -> Any:
     return value
 
 
-class _Shorthand(BeforeValidator):
+class Shorthand(BeforeValidator):
     """Accepts the short form of an axis, in validation and in the JSON schema."""
 
     def __get_pydantic_json_schema__(
@@ -135,7 +136,7 @@ class _Shorthand(BeforeValidator):
         return {"anyOf": [values["items"], short, long]}
 
 
-SHORTHAND = _Shorthand(_long_form)
+SHORTHAND = Shorthand(long_form)
 """Lets an axis be written in its short form."""
 TAGGED = Field(discriminator="type")
 """Stands before `SHORTHAND` if an axis has several forms."""

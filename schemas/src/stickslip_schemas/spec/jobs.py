@@ -67,7 +67,7 @@ class PresetName(StrEnum):
     thesis_low_big_dt = "thesis-low-big-dt"
 
 
-CONTACT_PROTOCOLS = ("capstan", "heavy-fold", "stacked-incline", "pull-out")
+CONTACT_PROTOCOLS = ("capstan", "edge", "heavy-fold", "stacked-incline", "pull-out")
 """Protocols that a certificate also needs if cloth touches itself or other cloth."""
 
 
@@ -305,6 +305,10 @@ class JobSpec(Document):
         """Return the values that a value of an axis puts into these fields."""
         return dict.fromkeys(self.fields_of(axis), value)
 
+    def key_value(self, axis: str, value: Any) -> Any:
+        """Return what content keys and seeds see of a value of an axis: by default the value."""
+        return value
+
     @property
     def artifacts(self) -> dict[str, Sha256]:
         """Artifacts that must be in the store, by JSON pointers into the spec."""
@@ -472,7 +476,7 @@ class JobSpec(Document):
         drawn: dict[str, int] = {}
         for rule in seeds:
             # A seed depends on values of axes, and not on the slot: a larger grid keeps it.
-            values = {axis: point[axis] for axis in self.seed_axes(rule)}
+            values = {axis: self.key_value(axis, point[axis]) for axis in self.seed_axes(rule)}
             drawn[rule.field] = derived_seed(self.seed, rule.purpose, values)
         return model(**{**settings, **fields, **drawn})
 

@@ -1,4 +1,4 @@
-"""Meanings of names in a spec: fabrics, textures, lamps, floors and cameras.
+"""Meanings of names in a spec: textures, lamps, floors and cameras.
 
 They are built in, or defined by numbers of the user.
 
@@ -38,94 +38,6 @@ class Material(StrEnum):
 
 
 MATERIAL_NAME = r"^[a-z0-9][a-z0-9-]{0,62}$"
-
-Stiffness = Annotated[Float, Field(ge=0, le=1e6)]
-Rigidity = Annotated[Float, Field(ge=1e-12, le=1)]
-
-MEMBRANE_MAX = 1e6
-"""Upper bound on membrane stiffness: entries of the stretching table, and E h [N/m]."""
-PLATE_BOUNDS = (1e-11, 1.0)
-"""Bounds on the plate rigidity from `young`, `poisson` and `thickness` [N m]."""
-
-
-class FabricNumbers(Document):
-    """The constitutive numbers of a custom fabric.
-
-    Give the resistance to stretching either as `stretching`, a table, or as `young`, `poisson` and
-    `thickness`. Give the resistance to bending as `bending`. With `young` you may leave it out: it
-    is then that of a plate of this thickness.
-    """
-
-    density: Float = Field(ge=0.01, le=5, description="mass per area [kg/m^2]")
-    stretching: tuple[tuple[Stiffness, Stiffness, Stiffness, Stiffness], ...] | None = Field(
-        default=None,
-        description="6 rows of (k0, k1, k2, k3) [N/m]; energy per area k0 G00^2/2 + k1 G00 G11 + "
-        "k2 G11^2/2 + k3 G01^2 "
-        "[Wang et al. 2011]. Row 0: no strain; rows 1 to 5: a stretch of 1 + 1/6 at 0, 22.5, 45, "
-        "67.5 and 90 degrees "
-        "from the warp",
-    )
-    young: Float | None = Field(
-        default=None, ge=1, le=1e12, description="Young's modulus [Pa] of an isotropic sheet"
-    )
-    poisson: Float | None = Field(
-        default=None, ge=0, le=0.49, description="Poisson's ratio of an isotropic sheet"
-    )
-    thickness: Float | None = Field(
-        default=None, ge=1e-6, le=0.01, description="thickness [m] of an isotropic sheet"
-    )
-    bending: tuple[Rigidity, Rigidity, Rigidity] | None = Field(
-        default=None,
-        description=(
-            "plate rigidities (along the warp, along the weft, twist) [N m], energy per "
-            "area H:D:H/2"
-        ),
-    )
-    damping: Float = Field(
-        default=0.0, ge=0, le=10, description="damping force over momentum [1/s]"
-    )
-
-    @model_validator(mode="after")
-    def _complete(self) -> Self:
-        # A table of stretching, or three numbers of an isotropic sheet.
-        isotropic = (self.young, self.poisson, self.thickness)
-        if self.stretching is not None:
-            if any(number is not None for number in isotropic):
-                raise ValueError("give stretching, or young, poisson and thickness, but not both")
-            if len(self.stretching) != 6:
-                raise ValueError(f"stretching must have 6 rows, and it has {len(self.stretching)}")
-            for row, (k0, k1, k2, _) in enumerate(self.stretching):
-                if not k1 * k1 < k0 * k2:
-                    raise ValueError(
-                        "stretching must be positive definite: k1^2 < k0 k2 in every row, but row "
-                        f"{row} has "
-                        f"k0 = {k0:g}, k1 = {k1:g}, k2 = {k2:g}"
-                    )
-            if self.bending is None:
-                raise ValueError(
-                    "bending must be given with stretching: a table says nothing of bending"
-                )
-        elif self.young is None or self.poisson is None or self.thickness is None:
-            raise ValueError("give stretching, or all of young, poisson and thickness")
-        else:
-            # E h is the stiffness of the sheet in its plane.
-            membrane = self.young * self.thickness
-            if membrane > MEMBRANE_MAX:
-                raise ValueError(
-                    f"young times thickness must be at most {MEMBRANE_MAX:g} N/m, and it is "
-                    f"{membrane:g}"
-                )
-            plate = (
-                membrane * self.thickness**2 / (12 * (1 - self.poisson**2))
-            )  # E h^3 / (12 (1 - nu^2))
-            if not PLATE_BOUNDS[0] <= plate <= PLATE_BOUNDS[1]:
-                low, high = PLATE_BOUNDS
-                raise ValueError(
-                    f"young and thickness must give a plate rigidity from {low:g} to {high:g} N m, "
-                    f"and it is {plate:g}"
-                )
-        return self
-
 
 CustomName = Annotated[str, Field(pattern=MATERIAL_NAME)]
 

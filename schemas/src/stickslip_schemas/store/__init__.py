@@ -319,10 +319,10 @@ class DirectoryStore:
                 else ()
             )
             # Versions show a damaged artifact by hard links, which all need the new file.
-            shown = [file for file in links if file.is_file() and file.samefile(path)]
+            damaged_links = [file for file in links if file.is_file() and file.samefile(path)]
             write_durably(path, data)
             # The link of a version still leads to the damaged file.
-            for file in shown:
+            for file in damaged_links:
                 _link(path, file)
         return digest
 

@@ -74,8 +74,8 @@ def check_quota(connection: Connection, name: str, sample_count: int) -> None:
     """Raise QuotaExceededError if one more job of `sample_count` samples exceeds the quota."""
     project = find_project(connection, name)
     if project.max_jobs is not None and project.jobs + 1 > project.max_jobs:
-        raise QuotaExceededError(name, "jobs", project.max_jobs, taken=project.jobs, asked=1)
+        raise QuotaExceededError(name, "jobs", project.max_jobs, used=project.jobs, requested=1)
     if project.max_samples is not None and project.samples + sample_count > project.max_samples:
         raise QuotaExceededError(
-            name, "samples", project.max_samples, taken=project.samples, asked=sample_count
+            name, "samples", project.max_samples, used=project.samples, requested=sample_count
         )

@@ -144,9 +144,9 @@ class JsonBody(Generic[T]):
             for field in fields[:SUMMARISED_ERRORS]
         ]
         detail = "; ".join(sentences)
-        others = error.error_count() - SUMMARISED_ERRORS
-        if others > 0:
-            detail += f" (and {others} more)"
+        further_errors = error.error_count() - SUMMARISED_ERRORS
+        if further_errors > 0:
+            detail += f" (and {further_errors} more)"
         return ProblemError(422, ProblemCode.validation_failed, detail, fields=fields)
 
 

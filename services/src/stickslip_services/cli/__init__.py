@@ -33,6 +33,7 @@ _SECTIONS = {
     ),
     "Datasets": dict.fromkeys(("datasets", "pull", "verify", "sign", "export"), "datasets"),
     "Scenes": dict.fromkeys(("scene", "simulate"), "specs"),
+    "Fabrics": dict.fromkeys(("fabrics", "lab"), "laboratory"),
     "Certificates": dict.fromkeys(("certify", "register", "certificates"), "workers"),
     "Administration": dict.fromkeys(("keys", "projects", "webhooks", "audit-log"), "admin"),
     "Maintenance": dict.fromkeys(("backup", "rm", "gc", "reindex", "scrub"), "maintenance"),

@@ -4,7 +4,8 @@ import datetime
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from collections.abc import Set as AbstractSet
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +15,17 @@ from stickslip_schemas.documents.problems import field_errors
 from stickslip_schemas.kinds import AnyJobSpec, job_spec_adapter
 from stickslip_schemas.scene.document import MAX_DOCUMENT_BYTES, Scene
 from stickslip_schemas.scene.library import load_scene
+from stickslip_schemas.spec.fabrics import FabricNumbers
 from stickslip_schemas.spec.jobs import JobSpec
-from stickslip_schemas.spec.names import MATERIAL_NAME
+from stickslip_schemas.spec.names import MATERIAL_NAME, Material
 from stickslip_schemas.spec.yaml_documents import parse_yaml
 
 from stickslip_services.cli.common import field_line
 from stickslip_services.client.errors import ClientError
 from stickslip_services.errors import CommandError
 
+FABRICS = "fabrics"
+"""Folder beside a spec or a scene with cards of fabrics, each named as its file."""
 SCENE_SUFFIXES = (".yaml", ".yml", ".json")
 """Suffixes of a `scene` that is a file; all other names mean built-in scenes."""
 MAX_VALUES = 1_000_000
@@ -183,8 +187,83 @@ def read_job(path: Path) -> tuple[dict[str, Any], dict[str, bytes]]:
     elif isinstance(stated, str) and Path(stated).suffix in SCENE_SUFFIXES:
         scene, files = read_scene(path.parent / stated)
     else:
-        return document, {}
-    return document | {"scene": scene.model_dump(mode="json")}, files
+        return _with_cards_of_axes(document, path), {}
+    document = document | {"scene": scene.model_dump(mode="json")}
+    return _with_cards_of_axes(document, path), files
+
+
+def _with_cards_of_axes(document: dict[str, Any], path: Path) -> dict[str, Any]:
+    """Return a spec with the cards of the folder `fabrics` that its axes name."""
+    cards = read_cards(path.parent, _words(document.get("axes")))
+    if not cards:
+        return document
+    scene = document.get("scene")
+    if scene is None:
+        return _with_cards(document, cards, path)
+    # The cards of a scene are in its document, so a built-in one is written out.
+    if isinstance(scene, str):
+        scene = find_scene(scene)[0].model_dump(mode="json")
+    return document | {"scene": _with_cards(scene, cards, path)}
+
+
+def _with_cards(
+    document: dict[str, Any], cards: Mapping[str, dict[str, Any]], path: Path
+) -> dict[str, Any]:
+    """Return a spec or a scene with more cards; raise CommandError for two of one name."""
+    defined = document.get("materials") or {}
+    # Materials that are no mapping have an error of their own.
+    if not isinstance(defined, dict):
+        return document
+    for name, card in cards.items():
+        if name in defined and defined[name] != card:
+            raise CommandError(
+                f"{path} must not define the fabric {name}, which {FABRICS}/ beside it has, too"
+            )
+    return document | {"materials": {**defined, **cards}}
+
+
+def read_cards(folder: Path, words: AbstractSet[str]) -> dict[str, dict[str, Any]]:
+    """Return the cards of the files in `fabrics/` of a folder that are among the words, by name.
+
+    Raises:
+        CommandError: A file holds no card.
+    """
+    cards: dict[str, dict[str, Any]] = {}
+    beside = folder / FABRICS
+    for file in sorted(beside.iterdir()) if beside.is_dir() else ():
+        if file.suffix in SCENE_SUFFIXES and file.stem in words:
+            if file.stem in cards:
+                raise CommandError(f"{beside} must have one file of the fabric {file.stem}")
+            if file.stem in list(Material):
+                raise CommandError(
+                    f"{file} must have another name: {file.stem} is the name of a built-in fabric"
+                )
+            cards[file.stem] = read_card(file).model_dump(mode="json", exclude_unset=True)
+    return cards
+
+
+def read_card(path: Path) -> FabricNumbers:
+    """Return the card of a fabric in a file.
+
+    Raises:
+        CommandError: The file holds no card, or it breaks rules; the message has all of them.
+    """
+    document = read_spec(path)
+    try:
+        return FabricNumbers.model_validate(document)
+    except ValidationError as error:
+        raise _not_valid(error, document, FabricNumbers, path) from error
+
+
+def _words(value: object) -> set[str]:
+    """Return all words in a part of a document."""
+    if isinstance(value, str):
+        return {value}
+    words: set[str] = set()
+    items = value.values() if isinstance(value, dict) else value
+    for item in items if isinstance(items, Iterable) else ():
+        words |= _words(item)
+    return words
 
 
 def find_scene(name: str) -> tuple[Scene, dict[str, bytes]]:
@@ -217,6 +296,9 @@ def read_scene(path: Path) -> tuple[Scene, dict[str, bytes]]:
 
 def _inline_files(document: dict[str, Any], path: Path) -> tuple[Scene, dict[str, bytes]]:
     """Return a scene with references by digest in place of names of files, and these files."""
+    cards = read_cards(path.parent, _words([document.get(key) for key in ("sheets", "parameters")]))
+    if cards:
+        document = _with_cards(document, cards, path)
     # The coordinator has the same limit, and would refuse the document later.
     length = len(json.dumps(document))
     if length > MAX_DOCUMENT_BYTES:

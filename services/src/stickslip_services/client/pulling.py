@@ -7,7 +7,7 @@ complete.
 
 import shutil
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -160,13 +160,7 @@ def pull(
     _refuse_small_disk(target, size)
     on_plan(count, size)
     downloader.download_all(missing)
-
-    # The manifest comes last: it says that the directory is complete.
-    if signature is not None and _read(target / SIGNATURE_NAME) != signature:
-        write_durably(target / SIGNATURE_NAME, signature)
-    for name, content in changed.items():
-        write_durably(target / name, content)
-        on_bytes(len(content))
+    _write_seal(target, signature, changed, on_bytes)
     # The directory holds the whole version now, and no part of it.
     if selection.is_everything:
         (target / SELECTION_NAME).unlink(missing_ok=True)
@@ -176,6 +170,23 @@ def pull(
         downloaded_files=count + part.label_files,
         downloaded_bytes=size + part.label_bytes,
     )
+
+
+def _write_seal(
+    target: Path,
+    signature: bytes | None,
+    changed: Mapping[str, bytes],
+    on_bytes: Callable[[int], None],
+) -> None:
+    """Write the signature, and the files that say that the directory is complete.
+
+    They come after all others, the manifest last.
+    """
+    if signature is not None and _read(target / SIGNATURE_NAME) != signature:
+        write_durably(target / SIGNATURE_NAME, signature)
+    for name, content in changed.items():
+        write_durably(target / name, content)
+        on_bytes(len(content))
 
 
 def _choose_part(

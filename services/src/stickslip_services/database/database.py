@@ -45,10 +45,10 @@ class Role(Enum):
 class Database:
     """Transactions on a database: any number of reads, and one write at a time."""
 
-    def __init__(self, reader: Engine, writer: Engine, *others: Engine) -> None:
+    def __init__(self, reader: Engine, writer: Engine, *further_engines: Engine) -> None:
         self._reader = reader
         self._writer = writer
-        self._engines = {reader, writer, *others}
+        self._engines = {reader, writer, *further_engines}
         # The database's own waiting is unfair, or takes a connection, so threads of this process
         # wait here.
         self._writing = threading.Lock()

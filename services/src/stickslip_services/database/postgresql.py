@@ -68,7 +68,7 @@ _REFUSALS = {
     Role.upkeep: "the database {} is in use by a coordinator, or by another `stickslip rm`, `gc` "
     "or `reindex`: stop it first",
 }
-_OTHERS = (
+_COUNT_OTHER_USERS = (
     f"SELECT count(*) FROM pg_locks WHERE locktype = 'advisory' AND classid = {_LOCKS} "
     "AND objid = 2 AND objsubid = 2 AND pid != pg_backend_pid() "
     "AND database = (SELECT oid FROM pg_database WHERE datname = current_database())"
@@ -142,7 +142,7 @@ class PostgresqlDatabase(Database):
             )
 
     def is_alone(self, connection: Connection) -> bool:
-        return not connection.exec_driver_sql(_OTHERS).scalar_one()
+        return not connection.exec_driver_sql(_COUNT_OTHER_USERS).scalar_one()
 
     async def listen(self, notify: Callable[[], None]) -> None:
         while True:

@@ -175,6 +175,17 @@ def _written(document: BaseModel, files: Mapping[str, bytes]) -> Iterator[tuple[
         yield [str(path), "--store", temporary], store
 
 
+def run_lab(request: Mapping[str, Any]) -> dict[str, Any]:
+    """Run a test of the textile laboratory, and return its result; raise CommandError.
+
+    The request has the test, the fabric and options, as the workers' program takes them.
+    """
+    with tempfile.TemporaryDirectory(prefix="stickslip-lab-") as temporary:
+        path = Path(temporary, "request.json")
+        path.write_text(json.dumps(request), encoding="utf-8")
+        return _workers(["lab", str(path)], "the fabric was not tested")
+
+
 def why_uncertified(spec: ClothSceneSpec, certificate: Certificate | None, build: str) -> str:
     """Return why no certificate vouches for the samples of a spec, or an empty text.
 
@@ -196,9 +207,11 @@ def why_uncertified(spec: ClothSceneSpec, certificate: Certificate | None, build
     return f"the certificate lacks what the scene needs: {', '.join(missing)}" if missing else ""
 
 
-def _workers(arguments: list[str]) -> dict[str, Any]:
-    """Run the workers' program and return its answer, which is JSON."""
-    answer: dict[str, Any] = json.loads(_run_workers(arguments, "nothing was made of the scene"))
+def _workers(
+    arguments: list[str], refusal: str = "nothing was made of the scene"
+) -> dict[str, Any]:
+    """Run the workers' program and return its answer, which is JSON; see `_run_workers`."""
+    answer: dict[str, Any] = json.loads(_run_workers(arguments, refusal))
     return answer
 
 

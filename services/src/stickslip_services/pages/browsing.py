@@ -116,7 +116,7 @@ def histograms(data: SampleData) -> list[dict[str, Any]]:
     """Return the distributions of the numeric labels over the valid samples, in order of groups."""
     valid = data.label("valid").astype(bool)
     group_of = groups_of(data)
-    found = []
+    histograms = []
     for name, array in data.arrays.items():
         if not _is_numeric_label(array):
             continue
@@ -126,10 +126,10 @@ def histograms(data: SampleData) -> list[dict[str, Any]]:
         if values.size < 2 or values.min() == values.max():
             continue
         bars = _bars(values)
-        found.append(
+        histograms.append(
             {"name": name, "text": array.description, "bars": bars, "group": group_of[name]}
         )
-    return sorted(found, key=lambda histogram: GROUPS.index(histogram["group"]))
+    return sorted(histograms, key=lambda histogram: GROUPS.index(histogram["group"]))
 
 
 def _is_numeric_label(array: ArrayLayout) -> bool:

@@ -20,6 +20,7 @@ import yaml
 from fastapi import Response
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from stickslip_schemas.scene.document import Scene
+from stickslip_schemas.scene.library import load_scene, scene_names
 from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.addresses import prefix, url
@@ -57,26 +58,53 @@ def _environment() -> Environment:
     )
     # Curves keep their order, and a script of the page could not read NaN.
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False}
-    filters = (duration, size, percent, number, moment, ago, words, plain)
+    filters = (duration, size, percent, number, moment, ago, words, plain, capitalized)
     environment.globals |= {"root": prefix, "service_url": url}
     environment.filters |= {function.__name__: function for function in filters}
     return environment
 
 
-def spec_text(spec: JobSpec) -> str:
-    """Return a spec as YAML, with short forms of its axes: a list, or the only value."""
+def spec_document(spec: JobSpec) -> dict[str, Any]:
+    """Return a spec as JSON without defaults; an axis of values is their list, or the only one."""
     document = spec.model_dump(mode="json", exclude_defaults=True) | {"kind": spec.kind}
     for name, axis in document["axes"].items():
         if axis["type"] == "list":
             values = axis["values"]
             document["axes"][name] = values[0] if len(values) == 1 else values
+    if spec.has_scene:
+        document["scene"] = _scene_entry(spec.scene)  # type: ignore[attr-defined]  # `has_scene`
+    return document
+
+
+def _scene_entry(scene: Scene) -> str | dict[str, Any]:
+    """Return what a spec says for a scene: the name of a built-in one, or its document."""
+    whole = scene.model_dump(mode="json")
+    for name, built_in in _built_in_scenes().items():
+        if whole == built_in:
+            return name
+    return scene_document(scene)
+
+
+@cache
+def _built_in_scenes() -> dict[str, dict[str, Any]]:
+    return {name: load_scene(name).model_dump(mode="json") for name in scene_names()}
+
+
+def spec_text(spec: JobSpec) -> str:
+    """Return a spec as YAML, with short forms of its axes."""
+    document = spec_document(spec)
     return yaml.safe_dump(document, sort_keys=False, allow_unicode=True, default_flow_style=None)
+
+
+def scene_document(scene: Scene) -> dict[str, Any]:
+    """Return the document of a scene as JSON."""
+    # As it was written: without its defaults, a document would lose the types of its parts.
+    return scene.model_dump(mode="json", exclude_unset=True)
 
 
 def scene_text(scene: Scene) -> str:
     """Return the document of a scene as YAML."""
-    # As it was written: without its defaults, a document would lose the types of its parts.
-    document = scene.model_dump(mode="json", exclude_unset=True)
+    document = scene_document(scene)
     return yaml.safe_dump(document, sort_keys=False, allow_unicode=True, default_flow_style=None)
 
 
@@ -105,6 +133,11 @@ def ago(value: datetime) -> str:
 def words(value: object) -> str:
     """Return the name of a state or reason as words, without underscores."""
     return str(value).replace("_", " ")
+
+
+def capitalized(text: str) -> str:
+    """Return a text that begins with a capital letter; the names in it stay as they are."""
+    return text[:1].upper() + text[1:]
 
 
 def plain(text: str) -> str:

@@ -36,7 +36,7 @@ AXIS_FORMS = {
 }
 """Forms of an axis of numbers, with the words of the page."""
 
-_ENDS = {"linspace": ("start", "stop"), "random": ("low", "high"), "sobol": ("low", "high")}
+RANGE_ENDS = {"linspace": ("start", "stop"), "random": ("low", "high"), "sobol": ("low", "high")}
 """Keys of the two ends of a range, by the form of the axis."""
 
 _SEPARATORS = re.compile(r"[\s,;]+")
@@ -84,6 +84,8 @@ class Axis:
     range: str = ""
     default: str = ""
     """The value without an axis; empty if there is none."""
+    can_draw: bool = False
+    """Whether fabrics may be drawn instead of chosen."""
 
 
 @dataclass(frozen=True)
@@ -96,8 +98,23 @@ class SubmitForm:
     scenes: tuple[str, ...]
     axes: tuple[Axis, ...]
     settings: tuple[Setting, ...]
-    others: tuple[str, ...] = ()
+    yaml_keys: tuple[str, ...] = ()
     """Keys that only YAML can give."""
+
+    @property
+    def first_axes(self) -> tuple[Axis, ...]:
+        """Those that a grid needs, and the parameters of a scene."""
+        return tuple(axis for axis in self.axes if self._comes_first(axis))
+
+    @property
+    def more_axes(self) -> tuple[Axis, ...]:
+        """All others."""
+        return tuple(axis for axis in self.axes if not self._comes_first(axis))
+
+    def _comes_first(self, axis: Axis) -> bool:
+        # Of a scene, what has a default is a parameter; looks have none.
+        is_parameter = self.scene is not None and bool(axis.default)
+        return axis.is_required or is_parameter
 
     @property
     def first_settings(self) -> tuple[Setting, ...]:
@@ -123,7 +140,7 @@ def form_of(kind: str, scene: str | None) -> SubmitForm:
     schema = spec_type.model_json_schema()
     scenes = scene_names() if "scene" in schema["properties"] else ()
     chosen = load_scene(scene or scenes[0]) if scenes else None
-    settings, others = _settings(schema)
+    settings, yaml_keys = _settings(schema)
     return SubmitForm(
         kind=kind,
         title=kinds()[kind] if chosen is None else chosen.description,
@@ -131,7 +148,7 @@ def form_of(kind: str, scene: str | None) -> SubmitForm:
         scenes=scenes,
         axes=tuple(_axes(spec_type, schema, chosen)),
         settings=settings,
-        others=others,
+        yaml_keys=yaml_keys,
     )
 
 
@@ -159,18 +176,18 @@ def _resolved(schema: Schema, whole: Schema) -> Schema:
 def _settings(schema: Schema) -> tuple[tuple[Setting, ...], tuple[str, ...]]:
     """Return the keys that have a field, and those that have none."""
     settings: dict[str, Setting] = {}
-    others: list[str] = []
+    yaml_keys: list[str] = []
     for name, raw in schema["properties"].items():
         if name in HANDLED:
             continue
         setting = _setting(name, _resolved(raw, schema), schema)
         if setting is None:
-            others.append(name)
+            yaml_keys.append(name)
         else:
             settings[name] = setting
     first = [settings[name] for name in FIRST_SETTINGS if name in settings]
     rest = [setting for name, setting in settings.items() if name not in FIRST_SETTINGS]
-    return (*first, *rest), tuple(others)
+    return (*first, *rest), tuple(yaml_keys)
 
 
 _SCALARS = {"boolean": "flag", "integer": "number", "number": "number", "string": "text"}
@@ -221,6 +238,7 @@ def _axes(spec_type: type[JobSpec], schema: Schema, scene: Scene | None) -> list
                     choices=choices,
                     range=parameter.range if is_number else "",
                     default=f"{default:g}" if is_number else str(default),
+                    can_draw=not is_number and not parameter.values,
                 )
             )
     of_axes = _resolved(schema["properties"]["axes"], schema)
@@ -234,7 +252,8 @@ def _axes(spec_type: type[JobSpec], schema: Schema, scene: Scene | None) -> list
 
 def _axis(name: str, schema: Schema, whole: Schema, is_required: bool) -> Axis:
     """Return an axis of the schema, whose first alternative is one value."""
-    value = _resolved(schema["anyOf"][0], whole)
+    forms = [_resolved(part, whole) for part in schema["anyOf"]]
+    value = forms[0]
     # Names are one of the built-in ones, or the name of a custom one.
     parts = [_resolved(part, whole) for part in value.get("anyOf", [value])]
     choices = tuple(choice for part in parts for choice in _choices(part))
@@ -247,6 +266,7 @@ def _axis(name: str, schema: Schema, whole: Schema, is_required: bool) -> Axis:
         is_number=is_number,
         choices=choices,
         range=" to ".join(f"{end:g}" for end in ends),
+        can_draw=any("distribution" in part.get("properties", ()) for part in forms),
     )
 
 
@@ -302,6 +322,8 @@ def _scalar(text: str) -> int | float | str:
 def _axis_value(axis: Axis, sent: Sent) -> object:
     """Return the value of an axis as a spec writes it; None if its fields are empty."""
     name = f"axes.{axis.name}"
+    if axis.can_draw and (num := _text(sent, f"{name}.num")):
+        return {"distribution": "measured-618", "num": _scalar(num)}
     if axis.choices:
         chosen = [value for value in sent.get(f"{name}.values", ()) if value]
         return _short(chosen)
@@ -309,12 +331,12 @@ def _axis_value(axis: Axis, sent: Sent) -> object:
     if form == "values":
         words = [word for word in _SEPARATORS.split(_text(sent, f"{name}.values")) if word]
         return _short([_scalar(word) if axis.is_number else word for word in words])
-    if form not in _ENDS:
+    if form not in RANGE_ENDS:
         raise FormError(name, f"must be one of {', '.join(AXIS_FORMS)}, and is {form[:50]!r}")
     parts = {key: _text(sent, f"{name}.{key}") for key in ("from", "to", "num")}
     if not any(parts.values()):
         return None
-    first, last = _ENDS[form]
+    first, last = RANGE_ENDS[form]
     keys = {first: parts["from"], last: parts["to"], "num": parts["num"]}
     # An empty part is left out, and the model says that it is required.
     return {"type": form, **{key: _scalar(text) for key, text in keys.items() if text}}

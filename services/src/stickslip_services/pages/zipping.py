@@ -33,9 +33,9 @@ class _Sink:
         """Do nothing: there is nothing to close."""
 
     def take(self) -> bytes:
-        taken = b"".join(self._parts)
+        data = b"".join(self._parts)
         self._parts.clear()
-        return taken
+        return data
 
 
 def zipped(data: SampleData, slots: Sequence[int]) -> Iterator[bytes]:

@@ -104,7 +104,9 @@ def _detail(
     """Return a row of `jobs` as the API shows a single job."""
     spec = spec_of(row)
     (entry,) = _entries(connection, [row], slots, frames)
-    detail = JobDetail(**dict(entry), spec=spec)
+    # Entry and spec have been validated. Another validation would count the values of all axes
+    # again, which takes longer than the queries where a list has thousands.
+    detail = JobDetail.model_construct(**dict(entry), spec=spec)
     # While the store takes no results, the database may not be writable either.
     if context.store_watch.trouble and detail.state in SCHEDULABLE:
         return detail.model_copy(

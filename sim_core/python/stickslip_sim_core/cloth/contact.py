@@ -7,7 +7,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stickslip_sim_core._sim_core import radius_least
+from stickslip_sim_core._sim_core import compression, radius_least
 from stickslip_sim_core.arrays import Floats, check_positive
 
 ORTHONORMAL = 1e-6
@@ -27,6 +27,9 @@ RADIUS_LEAST: float = radius_least
 
 On what is sharper friction is not right, so `Cloth` refuses it (`contact/bodies.hpp`).
 """
+
+COMPRESSION: float = compression
+"""Pressure that would close cloth between two bodies to nothing [Pa] (`contact/state.hpp`)."""
 
 ORIGIN = (0.0, 0.0, 0.0)
 UPRIGHT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))

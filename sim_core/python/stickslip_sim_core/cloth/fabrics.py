@@ -114,7 +114,7 @@ def custom_fabric(
     name: str,
     density: float,
     *,
-    stretching: ArrayLike | None = None,
+    stretching: ArrayLike | str | None = None,
     young: float | None = None,
     poisson: float | None = None,
     thickness: float | None = None,
@@ -128,7 +128,8 @@ def custom_fabric(
     Args:
         name: Name of the fabric in messages.
         density: Mass per area [kg/m^2].
-        stretching: Table (6, 4) [N/m], as `Fabric.stretching`. It excludes `young`.
+        stretching: Table (6, 4) [N/m], as `Fabric.stretching`, or the name of a measured fabric
+            that has it. It excludes `young`.
         young: Young's modulus [Pa] of an isotropic fabric with `poisson` and `thickness`.
         poisson: Poisson's ratio, in [0, 0.5]. None is 0.
         thickness: Thickness [m], for `young`.
@@ -162,7 +163,8 @@ def custom_fabric(
         table, rigidity = plate.stretching, plate.rigidity
     else:
         # A table says nothing about the thickness, so bending cannot follow from it.
-        table = np.asarray(stretching, float)
+        measured = fabric(stretching).stretching if isinstance(stretching, str) else stretching
+        table = np.asarray(measured, float)
         if bending is None:
             raise ValueError("bending: must be given with stretching")
     if bending is not None:

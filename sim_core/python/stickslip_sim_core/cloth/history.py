@@ -16,23 +16,39 @@ class StepHistory:
     """One row of measured numbers for each step."""
 
     def __init__(self) -> None:
-        self._rows: list[tuple[float, ...]] = []
-        self._friction: list[list[tuple[float, float]]] = []
+        self._steps = 0
+        # Both arrays have spare rows: the checks look at them many times while steps are added.
+        self._rows = np.zeros((0, len(_COLUMNS)))
+        self._friction = np.zeros((0, 0, 2))
 
     def add(self, duration: float, report: StepReport) -> None:
         """Add a step of `duration` [s]."""
         extremes = report.seen
-        self._rows.append(
-            (
-                duration,
-                extremes.contact_work,
-                extremes.flow,
-                report.unconverged,
-                report.missed,
-                report.uneven,
-            )
+        others = max(self._friction.shape[1], len(extremes.friction))
+        if self._steps == len(self._rows) or others > self._friction.shape[1]:
+            self._grow(others)
+        self._rows[self._steps] = (
+            duration,
+            extremes.contact_work,
+            extremes.flow,
+            report.unconverged,
+            report.missed,
+            report.uneven,
         )
-        self._friction.append(extremes.friction)
+        self._friction[self._steps, : len(extremes.friction)] = np.reshape(
+            extremes.friction, (-1, 2)
+        )
+        self._steps += 1
+
+    def _grow(self, others: int) -> None:
+        """Make room for as many steps again, and for friction with a number of others."""
+        steps = max(64, 2 * self._steps)
+        rows = np.zeros((steps, len(_COLUMNS)))
+        rows[: self._steps] = self._rows[: self._steps]
+        friction = np.zeros((steps, others, 2))
+        friction[: self._steps, : self._friction.shape[1]] = self._friction[: self._steps]
+        self._rows = rows
+        self._friction = friction
 
     @property
     def friction(self) -> Floats:
@@ -40,8 +56,7 @@ class StepHistory:
 
         The others are bodies, then surfaces, then sheets, with which cloth of another sheet rubs.
         """
-        others = max(map(len, self._friction), default=0)
-        return np.reshape(self._friction, (len(self._friction), others, 2))
+        return self._friction[: self._steps]
 
     def column(self, name: str) -> Floats:
         """Return a number of each step: (steps,).
@@ -49,8 +64,7 @@ class StepHistory:
         `duration` [s]; `contact_work` and `flow` [J], see `StepReport.seen`; `unconverged` and
         `missed`, both 0 or 1; `uneven` [m], see `StepReport`.
         """
-        rows = np.array(self._rows, float).reshape(-1, len(_COLUMNS))
-        return np.asarray(rows[:, _COLUMNS.index(name)])
+        return self._rows[: self._steps, _COLUMNS.index(name)]
 
 
 def worst_stretch(part: Floats, whole: Floats, most: float) -> float:

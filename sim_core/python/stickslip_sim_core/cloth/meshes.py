@@ -1,4 +1,4 @@
-"""Triangulations of rectangles, structured and unstructured."""
+"""Triangulations of rectangles, structured and unstructured, and of rings."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -172,6 +172,92 @@ def unstructured(
                 j += 1
     flipped = _delaunay(rest, triangles)
     return Mesh(rest - np.array([width, length]) / 2.0, np.array(flipped, dtype=np.int32))
+
+
+@dataclass(frozen=True, eq=False)
+class Ring:
+    """A triangulated ring whose inner edge is clamped."""
+
+    mesh: Mesh
+    clamped: float
+    """Vertices within this radius are clamped [m].
+
+    They are two circles: half a cell within the inner edge, and half a cell beyond it. Cloth that
+    is level between the circles is level at the edge itself.
+    """
+
+
+def ring(inner: float, outer: float, spacing: float, seed: int = 0) -> Ring:
+    """Triangulate the ring between two radii [m] by an unstructured Delaunay mesh.
+
+    Vertices are on circles about the middle, with edges of about `spacing`. Circles are turned at
+    random, and vertices within the ring are displaced at random by up to 0.2 spacings.
+
+    Raises:
+        ValueError: A size is not positive, or the ring is no wider than three spacings.
+    """
+    check_positive(inner=inner, outer=outer, spacing=spacing)
+    if not outer - inner >= 3.0 * spacing:
+        raise ValueError(
+            f"spacing: must be at most a third of the width of {outer - inner:g} m, got {spacing:g}"
+        )
+    rng = np.random.default_rng(seed)
+    # The height of an equilateral triangle is sqrt(0.75) times its side. The first circle is half
+    # a height within the inner edge.
+    circles = round((outer - inner) / (spacing * np.sqrt(0.75)))
+    height = (outer - inner) / (circles - 0.5)
+    radii = inner + height * (np.arange(circles + 1) - 0.5)
+    angles = []
+    strips = []
+    for number, radius in enumerate(radii):
+        count = round(2.0 * np.pi * radius / spacing)
+        # The two clamped circles and the outer one stay circles.
+        is_free = 1 < number < circles
+        across, along = rng.uniform(-0.2, 0.2, (2, count)) * spacing * is_free
+        angle = np.sort((np.arange(count) + rng.uniform()) * 2.0 * np.pi / count + along / radius)
+        distance = radius + across
+        angles.append(angle)
+        strips.append(np.column_stack([distance * np.cos(angle), distance * np.sin(angle)]))
+    starts = np.concatenate([[0], np.cumsum([len(strip) for strip in strips])])
+    triangles: list[tuple[int, int, int]] = []
+    for number in range(circles):
+        zipped = _zip_circles(angles[number], angles[number + 1])
+        offsets = (starts[number], starts[number + 1])
+        for triangle in zipped:
+            a, b, c = (int(offsets[circle] + vertex) for circle, vertex in triangle)
+            triangles.append((a, b, c))
+    rest = np.concatenate(strips)
+    flipped = _delaunay(rest, triangles)
+    return Ring(Mesh(rest, np.array(flipped, dtype=np.int32)), float(inner + 0.75 * height))
+
+
+Corner = tuple[int, int]
+"""Circle, 0 within and 1 beyond, and number of a vertex on it."""
+
+
+def _zip_circles(
+    within: NDArray[np.float64], beyond: NDArray[np.float64]
+) -> list[tuple[Corner, Corner, Corner]]:
+    """Return triangles between two circles, whose vertices have ascending angles [rad]."""
+    # Each circle is walked once around; its first vertex comes again at the end.
+    low = np.append(within, within[0] + 2.0 * np.pi)
+    high = np.append(beyond, beyond[0] + 2.0 * np.pi)
+    triangles: list[tuple[Corner, Corner, Corner]] = []
+    i = j = 0
+    while i < len(within) or j < len(beyond):
+        at_low: Corner = (0, i % len(within))
+        at_high: Corner = (1, j % len(beyond))
+        # Advance on the circle whose next edge has its middle at the smaller angle.
+        is_low = j == len(beyond) or (
+            i < len(within) and low[i] + low[i + 1] <= high[j] + high[j + 1]
+        )
+        if is_low:
+            i += 1
+            triangles.append((at_low, at_high, (0, i % len(within))))
+        else:
+            j += 1
+            triangles.append((at_low, at_high, (1, j % len(beyond))))
+    return triangles
 
 
 def _delaunay(

@@ -1,13 +1,11 @@
 """Named, frozen sets of solver settings for cloth."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-
-from stickslip_sim_core import _sim_core
 
 STEP_ERROR = 2e-4
 """Step error of `certified` [m]. Checks also judge presets with fixed steps by it."""
@@ -43,7 +41,7 @@ class SolverSettings:
     Beyond them all of the matrix is factorised again.
     """
 
-    patience: int = 10
+    newton_before_halving: int = 10
     """Iterations of Newton's method after which a step is halved rather than pursued, 1 ... 1000.
     """
 
@@ -74,22 +72,9 @@ class SolverSettings:
     unconverged_share_max: float = 0.002
     """Share of unconverged steps above which a simulation is not valid, 0 ... 1."""
 
-    constants: Mapping[str, float] = field(default_factory=dict, hash=False)
-    """Constants of the C++ solver to replace, by their names in `numbers`.
-
-    Tests replace them to learn how results depend on them.
-    """
-
     def numbers(self) -> dict[str, Any]:
-        """Return all numbers of the preset, by name.
-
-        Constants of the C++ solver have names of the form "group.name".
-        """
-        # Constants of the preset come last, so that they replace the solver's defaults.
-        own = {
-            item.name: getattr(self, item.name) for item in fields(self) if item.name != "constants"
-        }
-        return {**own, **_sim_core.cloth_constants(), **self.constants}
+        """Return all numbers of the preset, by name."""
+        return {item.name: getattr(self, item.name) for item in fields(self)}
 
     def __post_init__(self) -> None:
         if not self.name:
@@ -103,7 +88,7 @@ class SolverSettings:
         for name, low, high in (
             ("newton_max", 1, 1000),
             ("refactor_after", 0, 10_000),
-            ("patience", 1, 1000),
+            ("newton_before_halving", 1, 1000),
             ("halvings_max", 0, 20),
             ("newton_per_second", 1, 1_000_000),
         ):

@@ -32,7 +32,7 @@ PASSED_ON = (
     "newton_max",
     "krylov_tolerance",
     "refactor_after",
-    "patience",
+    "newton_before_halving",
     "halvings_max",
     "finest",
 )
@@ -148,7 +148,6 @@ class Cloth:
             surface_of_vertex=np.repeat(np.arange(len(sizes)), sizes).tolist(),
             surface_positions=self._surfaces_at(self.time),
             crease=[surface.crease for surface in self.surfaces],
-            constants=dict(preset.constants),
         )
         self._solver = self._make(held=self.held.tolist())
         # Time, positions and velocities before the last step. The time inf stands for no step yet.
@@ -236,6 +235,22 @@ class Cloth:
     def sliding(self) -> NDArray[np.bool_]:
         """Whether each vertex slides on its body or surface: (V,)."""
         return np.asarray(self._solver.sliding(), dtype=bool)
+
+    @property
+    def opposites(self) -> NDArray[np.int32]:
+        """The body that presses each vertex against the one that it touches (V,), or -1.
+
+        Between two bodies that face each other cloth is as thick as it is in self-contact.
+        """
+        return np.asarray(self._solver.opposites(), dtype=np.int32)
+
+    @property
+    def opposite_forces(self) -> Floats:
+        """Forces of `opposites` on the vertices (V, 3) [N], which are part of `reactions`.
+
+        The friction of both bodies together is known. It is shared as their normal forces are.
+        """
+        return np.asarray(self._solver.opposite_forces())
 
     @property
     def pair_forces(self) -> PairForces:
@@ -329,6 +344,8 @@ class Cloth:
         path: Path | None = None,
         event: float = np.inf,
         damping: Callable[[float], float] = lambda _time: 0.0,
+        is_over: Callable[[], bool] = lambda: False,
+        may_fail: Callable[[], bool] = lambda: True,
     ) -> None:
         """Take steps until one ends at `end` [s] or later.
 
@@ -346,6 +363,9 @@ class Cloth:
                 `motion` for each time.
             event: Time of the next sudden change of the motion [s]. A step ends there.
             damping: Damping proportional to mass [1/s], added to the damping of each fabric.
+            is_over: Function that returns whether to stop, which is asked after each step.
+            may_fail: Function that returns whether a step may stay unconverged, which is asked
+                before each step. Otherwise such a step is given up soon, and no step may follow.
 
         Raises:
             ValueError: `event` has passed, or `end` is not a number.
@@ -382,7 +402,7 @@ class Cloth:
         while self.time < end and self.spent <= 1.0:
             # `positions_at` interpolates between the two ends of this step.
             self._before = self.time, self.positions, self.velocities
-            self.time, report = self._solver.advance(self.time, event, drive, track)
+            self.time, report = self._solver.advance(self.time, event, drive, track, may_fail())
             self.total.add(report)
             self.history.add(self.time - self._before[0], report)
             # The sum of iterations drains at the allowed rate. A few hard steps therefore stay
@@ -393,6 +413,8 @@ class Cloth:
                     max(0.0, self._spent - allowed * (self.time - self._before[0])) + report.newton
                 )
                 self.spent = max(self.spent, self._spent / allowed)
+            if is_over():
+                return
 
     @property
     def last_begin(self) -> float:

@@ -11,10 +11,12 @@ from typing import Any
 from stickslip_sim_core.cloth.presets import PRESETS, SolverSettings
 from stickslip_sim_core.protocols.cantilever import Cantilever
 from stickslip_sim_core.protocols.capstan import Capstan
+from stickslip_sim_core.protocols.edge import Edge
+from stickslip_sim_core.protocols.gripper import Gripper
 from stickslip_sim_core.protocols.heavy_fold import HeavyFold
 from stickslip_sim_core.protocols.inclined_plane import InclinedPlane, StackedIncline
 from stickslip_sim_core.protocols.lateral_buckling import LateralBuckling
-from stickslip_sim_core.protocols.motion import Fall, SlideToRest
+from stickslip_sim_core.protocols.motion import Fall, Impact, SlideToRest
 from stickslip_sim_core.protocols.protocol import Protocol
 from stickslip_sim_core.protocols.pull_out import PullOut
 from stickslip_sim_core.protocols.result import Curve, ProtocolResult
@@ -41,8 +43,11 @@ PROTOCOLS: Mapping[str, type[Protocol]] = MappingProxyType(
             PullOut,
             HeavyFold,
             Capstan,
+            Edge,
+            Gripper,
             Fall,
             SlideToRest,
+            Impact,
         )
     }
 )
@@ -84,6 +89,9 @@ QUICK: Mapping[str, Mapping[str, Any]] = {
     "stacked-incline": {"friction": (0.3,), "sheets": (2,), "unstructured": 0},
     "fall": {"durations": (0.3,)},
     "slide-to-rest": {"friction": (0.3,)},
+    "impact": {"heights": (0.005,)},
+    "gripper": {"friction": (0.3,)},
+    "edge": {"radii": (2.0,), "friction": (0.3,), "edges": (0,)},
     "pull-out": {"friction": (0.3,), "loads": (1.0,), "unstructured": 0},
 }
 
@@ -99,9 +107,9 @@ class Certification:
     """Module whose build the certificate vouches for."""
 
     numbers: Callable[[], Mapping[str, Any]] = dict
-    """Function that returns the settings of the preset and constants of the solver.
+    """Function that returns the settings of the preset.
 
-    The values have JSON's types.
+    The values have JSON's types. Constants of the solver belong to its build.
     """
 
     quick: Mapping[str, Mapping[str, Any]] = field(default_factory=lambda: QUICK)
@@ -111,13 +119,15 @@ class Certification:
 _CLOTH = (
     "fall",
     "slide-to-rest",
+    "impact",
+    "gripper",
     "inclined-plane",
     "lateral-buckling",
     "stick-slip",
     "cantilever",
 )
-SCENE_PROTOCOLS = (*_CLOTH, "capstan", "heavy-fold", "stacked-incline", "pull-out")
-"""Protocols that a certificate needs for a scene with self-contact."""
+SCENE_PROTOCOLS = (*_CLOTH, "capstan", "edge", "heavy-fold", "stacked-incline", "pull-out")
+"""Protocols that a certificate needs for a scene with contact of cloth with cloth or meshes."""
 
 
 def _of_cloth(preset: SolverSettings) -> Certification:

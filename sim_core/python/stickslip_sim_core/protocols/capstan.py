@@ -32,6 +32,9 @@ DENSITY = 0.1  # kg/m^2
 STRETCHING = 2e4  # N/m
 SPEED = 0.01  # m/s
 DAMPING = 2.0  # 1/s
+# The strip first takes up the light pull without friction, for this time [s]. One that rests
+# without tension cannot take up all of it in a single step with friction.
+SETTLING = 0.2
 # The measurement of the heavy pull begins after this time [s].
 SLIDING = 1.2
 # The mean covers this time [s], in which the strip slides by two cells.
@@ -78,8 +81,11 @@ class Capstan(ClothProtocol):
 class Strip:
     """A strip without weight over a cylinder along y, two cells wide.
 
-    A pull of `LIGHT` hangs on its free end.
+    A pull of `light_pull` hangs on its free end.
     """
+
+    light_pull: ClassVar[float] = LIGHT
+    """Pull at the free end [N/m]."""
 
     apart: ClassVar[float] = 0.0
     """Distance from the cylinder at the start, in thicknesses."""
@@ -98,16 +104,12 @@ class Strip:
         mesh = meshes.grid(cells * self.cell, WIDTH * self.cell, cells, WIDTH)
         along = mesh.rest[:, 0] - mesh.rest[:, 0].min() - free * self.cell
         self.held = np.flatnonzero(along > along.max() - 0.1 * self.cell)
-        light = np.flatnonzero(along < along.min() + 0.1 * self.cell)
+        self.light = np.flatnonzero(along < along.min() + 0.1 * self.cell)
         self.bodies: list[Body] = []
         self.below = np.empty((0, 3))
         """Held vertices of other cloth, after those of the strip."""
-        material = isotropic(DENSITY, STRETCHING, 2.0 * RADIUS**2 * bending * LIGHT)
-        self.cloth = self.over(mu, mesh, material, FORCE_SHARE * LIGHT * self.cell)
+        material = isotropic(DENSITY, STRETCHING, 2.0 * RADIUS**2 * bending * self.light_pull)
         self.breadth = WIDTH * self.cell
-        # Gravity on the vertices of the free end stands for the pull. The rest has no weight.
-        self.cloth.gravity[:] = 0.0
-        self.cloth.gravity[light, 2] = -LIGHT * self.breadth / self.cloth.masses[light].sum()
         # The strip starts wrapped around the cylinder, with both free ends tangential to it.
         clearance = RADIUS + self.apart * THICKNESS
         angle = np.clip(along / RADIUS, 0.0, WRAP)
@@ -120,9 +122,28 @@ class Strip:
             ]
         )
         self.ahead = np.array([np.sin(WRAP), 0.0, np.cos(WRAP)])
-        self.cloth.set_state(np.concatenate([self.start, self.below]))
+        force_scale = FORCE_SHARE * self.light_pull * self.cell
+        settled = self._settled(self._pulled(self.over(0.0, mesh, material, force_scale)))
+        self.cloth = self._pulled(self.over(mu, mesh, material, force_scale))
+        self.cloth.set_state(settled)
         self.iterations = 0.0
         """Mean number of Newton's iterations in a measured step."""
+
+    def _pulled(self, cloth: Cloth) -> Cloth:
+        """Let gravity on the vertices of the free end stand for the light pull."""
+        cloth.gravity[:] = 0.0
+        cloth.gravity[self.light, 2] = (
+            -self.light_pull * self.breadth / cloth.masses[self.light].sum()
+        )
+        return cloth
+
+    def _settled(self, smooth: Cloth) -> Floats:
+        """Return the positions (V, 3) [m] of cloth that bears the light pull without friction."""
+        smooth.set_state(np.concatenate([self.start, self.below]))
+        ends = np.concatenate([self.start[self.held], self.below])
+        for _ in range(round(SETTLING / self.preset.time_step)):
+            smooth.step(self.preset.time_step, held=ends, bodies=self.bodies, damping=DAMPING)
+        return smooth.positions
 
     def over(self, mu: float, mesh: meshes.Mesh, material: Fabric, force_scale: float) -> Cloth:
         """Return the cloth that slides over the cylinder. Tests let it slide over other bodies."""

@@ -66,16 +66,20 @@ class LateralBuckling(RefinedProtocol):
     poisson: Sequence[float] = POISSON
 
     def measure_with(self, cells: int, x: float, at: Mapping[str, Any]) -> float:
-        return threshold(
-            strip(x * LENGTH, cells, self.kinds[at["mesh"]]), at["poisson"], self.solver
-        )
+        clamped = strip(x * LENGTH, cells, self.kinds[at["mesh"]])
+        weight, cloth = threshold(clamped, at["poisson"], self.solver)
+        self.tally.count(cloth)
+        return weight
 
     def master(self, x: float, at: Mapping[str, Any]) -> float:
         return float(master_curves.lateral_buckling(x, at["poisson"]))
 
 
-def threshold(clamped: Strip, poisson: float, preset: SolverSettings) -> float:
-    """Return Gamma at which the flat strip, loaded in its plane, loses stability."""
+def threshold(clamped: Strip, poisson: float, preset: SolverSettings) -> tuple[float, Cloth]:
+    """Return Gamma at which the flat strip, loaded in its plane, loses stability, and the cloth.
+
+    Gamma is NaN if there is none.
+    """
     # Before the first step no stress acts, so the first matrix has bending alone.
     cloth, flat = loaded(clamped, poisson, RIGIDITY, preset)
     held = clamped.held
@@ -85,7 +89,7 @@ def threshold(clamped: Strip, poisson: float, preset: SolverSettings) -> float:
         cloth.step(preset.time_step * GROWTH**step, held=flat[held])
     stress = out_of_plane(cloth, cloth.positions, free) - bending
     if not np.isfinite(stress.data).all():
-        return np.nan
+        return np.nan, cloth
     # bending + lambda stress is first singular at 1/lambda, the largest eigenvalue of -stress over
     # bending.
     inverse = LinearOperator(bending.shape, splu(bending).solve)
@@ -96,7 +100,8 @@ def threshold(clamped: Strip, poisson: float, preset: SolverSettings) -> float:
             0
         ]
     )
-    return float(DENSITY * GRAVITY * LENGTH**3 / RIGIDITY / largest) if largest > 0.0 else np.nan
+    weight = DENSITY * GRAVITY * LENGTH**3 / RIGIDITY
+    return float(weight / largest) if largest > 0.0 else np.nan, cloth
 
 
 def loaded(

@@ -1,7 +1,7 @@
 """Scenes from a document of sheets, holders, bodies and their friction."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from stickslip_sim_core._sim_core import sheet_count
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
-from stickslip_sim_core.cloth.contact import Body, SelfContact
+from stickslip_sim_core.cloth.contact import SelfContact
 from stickslip_sim_core.cloth.presets import preset_named
 from stickslip_sim_core.cloth.solver import Cloth
+from stickslip_sim_core.scenes.holders import Holder
 from stickslip_sim_core.scenes.kind import IMPOSSIBLE_START, Kind, OnFrame, Outcome, Record
 from stickslip_sim_core.scenes.parts import Document, Sheet, Thing, sheet, thing
 from stickslip_sim_core.scenes.scene import ClothRun, Scene, cloth_kernel, fabric_labels
@@ -46,13 +47,53 @@ def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Sc
     Raises:
         ValueError: A value breaks its rule. The message begins with the place of the value.
     """
-    names = sorted(document["sheets"])
     mu = _friction(document)
+    sheets = _sheets(document, seed, kernel)
+    things = _things(document, sheets, mu)
+    held = _held(sheets)
+    gravity = _Gravity(document, sheets, seed)
+    # Surfaces move as `Surface` objects, so `motion` and `poses` have rigid bodies only.
+    rigid = [body.rigid for body in things if body.rigid is not None]
+    rigid_poses = [body.pose for body in things if body.rigid is not None]
+    calm = document["calm"]
+    return Scene(
+        mesh=meshes.together(*(part.mesh for part in sheets)),
+        fabrics=[part.fabric for part in sheets],
+        preset=preset_named(document["preset"]),
+        start=np.concatenate([part.start for part in sheets]),
+        motion=lambda time: (gravity.at(time), [body_at(time) for body_at in rigid]),
+        poses=lambda times: np.swapaxes(
+            np.reshape([pose(times) for pose in rigid_poses], (-1, len(times), 3, 4)), 0, 1
+        ),
+        holders=held.holders,
+        self_contact=_touch(document, sheets, mu),
+        surfaces=[body.surface for body in things if body.surface is not None],
+        damping=lambda time: calm["rate"] if calm is not None and time <= calm["until"] else 0.0,
+        frames=_frames(document),
+        frame_rate=document["frame_rate"],
+        still_from=None if document["end"] is None else _last_change(gravity, sheets, things),
+        forces=_Forces(sheets, things, held.holders),
+        tracks=_tracks(things, held),
+        record={"holder_box": np.stack(held.boxes)} if held.boxes else {},
+        arrays=lambda run: _arrays(run, sheets, things),
+        labels=lambda run: _labels(run, document, sheets, gravity.bias),
+        kernel=kernel,
+        others=[
+            *(f"bodies.{body.name}" for body in things if body.rigid is not None),
+            *(f"bodies.{body.name}" for body in things if body.surface is not None),
+            *(f"sheets.{part.name}" for part in sheets),
+        ],
+        reason=_hanging_fault(sheets),
+    )
+
+
+def _sheets(document: Document, seed: int, kernel: str | None) -> list[Sheet]:
+    """Return the sheets in the order of their names."""
     sheets = []
-    for name in names:
+    for name, described in sorted(document["sheets"].items()):
         part = sheet(
             name,
-            document["sheets"][name],
+            described,
             document["materials"],
             gravity=document["gravity"],
             seed=seed,
@@ -63,81 +104,82 @@ def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Sc
         if sheet_count(part.mesh.rest, part.mesh.triangles) != 1:
             raise ValueError(f"sheets.{name}.mesh: must hang together in one piece")
         sheets.append(part)
-    things = []
+    return sheets
+
+
+def _things(
+    document: Document, sheets: Sequence[Sheet], mu: Mapping[tuple[str, str], float]
+) -> list[Thing]:
+    """Return the bodies in the order of their names, with their friction by sheet."""
     cell = max(part.mesh.spacing for part in sheets)
+    things = []
     for name, body in sorted(document["bodies"].items()):
-        by_sheet = [mu[sheet_name, name] for sheet_name in names]
+        by_sheet = [mu[part.name, name] for part in sheets]
         things.append(thing(name, body, by_sheet, cell=cell))
-    # The solver numbers the vertices of all sheets together, one sheet after the other.
-    ends = np.cumsum([0, *(len(part.start) for part in sheets)])
-    holders = []
+    return things
+
+
+@dataclass(frozen=True)
+class _Held:
+    """The holders of all sheets, in the order of sheets and of their names."""
+
+    holders: Sequence[Holder]
+    """Their vertices are numbered through all sheets."""
+
+    poses: Sequence[Callable[[float], Floats]]
+    boxes: Sequence[Floats]
+
+
+def _held(sheets: Sequence[Sheet]) -> _Held:
+    holders: list[Holder] = []
     poses: list[Callable[[float], Floats]] = []
     boxes: list[Floats] = []
-    for part, begin in zip(sheets, ends, strict=False):
+    # The solver numbers the vertices of all sheets together, one sheet after the other.
+    for part, begin in zip(sheets, _vertex_begins(sheets), strict=False):
         for holder in part.holders.values():
             holders.append(replace(holder, vertices=holder.vertices + begin))
         poses += part.tracks.values()
         boxes += part.boxes.values()
-    gravity = _Gravity(document, sheets, seed)
-    # Surfaces move as `Surface` objects, so `motion` and `poses` have rigid bodies only.
-    rigid = [body.rigid for body in things if body.rigid is not None]
-    placed = [body.pose for body in things if body.rigid is not None]
+    return _Held(holders, poses, boxes)
 
-    def motion(time: float) -> tuple[Floats, Sequence[Body]]:
-        return gravity.at(time), [at(time) for at in rigid]
 
-    length = document["duration"]
+def _vertex_begins(sheets: Sequence[Sheet]) -> NDArray[np.int64]:
+    """Return the number of the first vertex of each sheet, and at the end that of all vertices."""
+    return np.cumsum([0, *(len(part.start) for part in sheets)])
+
+
+def _frames(document: Document) -> int:
+    """Return the number of frames up to the end, which may come earlier."""
     end = document["end"]
-    calm = document["calm"]
-    # Cloth that is still before this time may yet be moved, so the scene must not end there.
-    last = max(
-        [0.0, gravity.last, *(part.last for part in sheets), *(body.last for body in things)]
-    )
-    tracks = {
+    length: float = document["duration"] if end is None else end["at_most"]
+    # The factor keeps the last frame if rounding puts it just after the end of the scene.
+    return int(length * document["frame_rate"] * (1.0 + 1e-12)) + 1
+
+
+def _last_change(gravity: "_Gravity", sheets: Sequence[Sheet], things: Sequence[Thing]) -> float:
+    """Return the time of the last motion or change of gravity [s].
+
+    Cloth that is still before may yet be moved, so the scene must not end there.
+    """
+    of_parts = [*(part.last for part in sheets), *(body.last for body in things)]
+    return max([0.0, gravity.last, *of_parts])
+
+
+def _tracks(things: Sequence[Thing], held: _Held) -> dict[str, Callable[[float], NDArray[Any]]]:
+    """Return what a run records of bodies and holders at the time of each frame, by name."""
+    tracks: dict[str, Callable[[float], NDArray[Any]]] = {
         f"{body.name}.vertices": body.surface.at
         for body in things
         if body.surface is not None and body.deforms
     }
     if things:
         tracks["body_pose"] = lambda time: np.stack([body.pose(time) for body in things])
-    if holders:
-        tracks["holder_pose"] = lambda time: np.stack([pose(time) for pose in poses])
+    if held.holders:
+        tracks["holder_pose"] = lambda time: np.stack([pose(time) for pose in held.poses])
         tracks["grasped"] = lambda time: np.array(
-            [holder.holds(time) for holder in holders], np.uint8
+            [holder.holds(time) for holder in held.holders], np.uint8
         )
-    return Scene(
-        mesh=meshes.together(*(part.mesh for part in sheets)),
-        fabrics=[part.fabric for part in sheets],
-        preset=preset_named(document["preset"]),
-        start=np.concatenate([part.start for part in sheets]),
-        motion=motion,
-        poses=lambda times: np.swapaxes(
-            np.reshape([at(times) for at in placed], (-1, len(times), 3, 4)), 0, 1
-        ),
-        holders=holders,
-        self_contact=_touch(document, sheets, mu),
-        surfaces=[body.surface for body in things if body.surface is not None],
-        damping=lambda time: calm["rate"] if calm is not None and time <= calm["until"] else 0.0,
-        # The factor keeps the last frame if rounding puts it just after the end of the scene.
-        frames=int(
-            (length if end is None else end["at_most"]) * document["frame_rate"] * (1.0 + 1e-12)
-        )
-        + 1,
-        frame_rate=document["frame_rate"],
-        still_from=None if end is None else last,
-        forces=_Forces(sheets, things, holders),
-        tracks=tracks,
-        record={"holder_box": np.stack(boxes)} if boxes else {},
-        arrays=lambda run: _arrays(run, sheets, things, ends),
-        labels=lambda run: _labels(run, document, sheets, gravity.bias),
-        kernel=kernel,
-        others=[
-            *(f"bodies.{body.name}" for body in things if body.rigid is not None),
-            *(f"bodies.{body.name}" for body in things if body.surface is not None),
-            *(f"sheets.{name}" for name in names),
-        ],
-        reason=_hanging_fault(sheets),
-    )
+    return tracks
 
 
 def _hanging_fault(sheets: Sequence[Sheet]) -> str:
@@ -260,11 +302,19 @@ class _Forces:
             # The reaction of a held vertex is the force of its holder, and no contact.
             held = np.isin(np.arange(vertices), cloth.held)
             touching = np.flatnonzero((contacts >= 0) & ~held)
+            opposites = cloth.opposites
+            across = cloth.opposite_forces
+            pressed = np.flatnonzero(opposites >= 0)
             # Several vertices add to the same entry, which `force[...] +=` would count once.
             np.add.at(
                 force,
                 (self._owner[touching], self._others[contacts[touching]]),
-                reactions[touching],
+                reactions[touching] - across[touching],
+            )
+            np.add.at(
+                force,
+                (self._owner[pressed], self._others[opposites[pressed]]),
+                across[pressed],
             )
             state[touching] = np.where(cloth.sliding[touching], 2, 1)
             owner = self._owner[pairs.vertices]
@@ -309,19 +359,18 @@ def _nearest(weights: Floats) -> NDArray[np.bool_]:
     return nearest
 
 
-def _arrays(
-    run: ClothRun, sheets: Sequence[Sheet], things: Sequence[Thing], ends: NDArray[np.int64]
-) -> Record:
-    found: dict[str, Any] = {}
-    for one, path in zip(sheets, np.split(run.positions, ends[1:-1], axis=1), strict=True):
-        found[f"{one.name}.positions"] = path
-        found[f"{one.name}.rest"] = one.mesh.rest
-        found[f"{one.name}.triangles"] = one.mesh.triangles
+def _arrays(run: ClothRun, sheets: Sequence[Sheet], things: Sequence[Thing]) -> Record:
+    arrays: dict[str, Any] = {}
+    inner_begins = _vertex_begins(sheets)[1:-1]
+    for part, positions in zip(sheets, np.split(run.positions, inner_begins, axis=1), strict=True):
+        arrays[f"{part.name}.positions"] = positions
+        arrays[f"{part.name}.rest"] = part.mesh.rest
+        arrays[f"{part.name}.triangles"] = part.mesh.triangles
     for body in things:
         if body.surface is not None:
-            found[f"{body.name}.rest"] = body.rest
-            found[f"{body.name}.triangles"] = np.asarray(body.surface.triangles)
-    return found
+            arrays[f"{body.name}.rest"] = body.rest
+            arrays[f"{body.name}.triangles"] = np.asarray(body.surface.triangles)
+    return arrays
 
 
 def _labels(

@@ -185,7 +185,7 @@ class Scene:
         return Begun(hands, cloth)
 
     def run(self, on_frame: OnFrame | None = None, begun: Begun | None = None) -> ClothRun:
-        """Simulate the scene until it ends, its budget is spent or a position is not finite.
+        """Simulate the scene until it ends, or until a check has failed.
 
         The solver's steps do not depend on the frames: positions at a frame are interpolated within
         a step. `begun` is the result of `begin`, for callers that treat its errors separately.
@@ -200,11 +200,13 @@ class Scene:
         crossed = [first.crossings]
         calm = 0
         rest_time = np.nan
-        for frame in range(1, self.frames):
+        verdict = checks.Verdict(cloth)
+        # No run of a scene with a reason is valid, so it has its first frame alone.
+        for frame in range(1, 1 if self.reason else self.frames):
             time = frame / self.frame_rate
-            self._advance(cloth, hands, time)
-            # The budget of iterations is spent, and the cloth has not reached the frame.
-            if cloth.spent > 1.0:
+            self._advance(cloth, hands, time, verdict)
+            # A check has failed, or the budget is spent, and the cloth has not reached the frame.
+            if cloth.time < time:
                 break
             now = frame_at(cloth, time, lambda time: self.motion(time)[1])
             paths.append(now.positions)
@@ -212,8 +214,7 @@ class Scene:
             forces.append(self.forces(cloth))
             if on_frame is not None:
                 on_frame(frame + 1, self.frames)
-            # The frame stays in the path, where the check `not_finite` counts it.
-            if not np.isfinite(paths[-1]).all():
+            if verdict.see_frame(now.crossings if self.self_contact else 0):
                 break
             calm = calm + 1 if self._is_still(time, paths[-2], paths[-1]) else 0
             if calm >= REST_TIME * self.frame_rate:
@@ -234,7 +235,8 @@ class Scene:
         # Without self-contact cloth may pass through itself, so crossings are no fault.
         evidence = checks.Seen(
             cloth,
-            path,
+            # A lost run stops between frames, and its last positions may be no numbers.
+            np.concatenate([path, cloth.positions[None]]),
             max(crossed) if self.self_contact else 0,
             uneven_until(times[-1], cloth, hands.driving(self.motion)),
             self.others,
@@ -272,11 +274,14 @@ class Scene:
             return False
         return float(np.linalg.norm(now - before, axis=1).max()) <= REST_SPEED / self.frame_rate
 
-    def _advance(self, cloth: Cloth, hands: Hands, end: float) -> None:
-        """Take steps until one ends at `end` [s] or later, and grasp and release on the way."""
+    def _advance(self, cloth: Cloth, hands: Hands, end: float, verdict: checks.Verdict) -> None:
+        """Take steps until one ends at `end` [s] or later, and grasp and release on the way.
+
+        A lost run stops before.
+        """
         poses = self.poses
         path = None if poses is None else lambda times: (hands.at(times), poses(times))
-        while cloth.time < end and cloth.spent <= 1.0:
+        while cloth.time < end and cloth.spent <= 1.0 and not verdict.is_lost:
             # A step ends exactly at each event, so equal times are a safe test.
             if cloth.time in hands.events:
                 cloth.hold(hands.take(cloth.time, cloth.positions), self.motion(cloth.time)[1])
@@ -287,6 +292,8 @@ class Scene:
                 path=path,
                 event=event,
                 damping=self.damping,
+                is_over=verdict.see_step,
+                may_fail=verdict.allows_failure,
             )
 
     def outcome(self, on_frame: OnFrame | None = None) -> Outcome:

@@ -49,7 +49,7 @@ class NamedSet:
     """Of the samples to answer; None: all."""
     published: Sequence[str]
     """Digests of the manifests of versions that were published."""
-    seen: dict[str, Array]
+    control_values: dict[str, Array]
 
     @property
     def parsed_spec(self) -> JobSpec:
@@ -78,8 +78,8 @@ class NamedSet:
                 f"{digest}, and those of the set "
                 f"{self.labels}. Samples were rejected here, or the dataset is in parts"
             )
-        for name, found_here in self.task.seen(reader, slots).items():
-            off = np.abs(found_here - self.seen[name].astype(np.float64)).max()
+        for name, actual in self.task.control_values(reader, slots).items():
+            off = np.abs(actual - self.control_values[name].astype(np.float64)).max()
             allowed = self.task.tolerances[name]
             if not off <= allowed:
                 raise ValueError(
@@ -106,8 +106,8 @@ def load_set(name: str) -> NamedSet:
         raise ValueError(f"the test set must be one of {', '.join(set_names())}, and is {name}")
     document = json.loads((SETS / f"{name}.json").read_text(encoding="utf-8"))
     with np.load(SETS / f"{name}.npz") as file:
-        seen = {each: file[each] for each in file.files}
-    return NamedSet(name=name, seen=seen, **document)
+        control_values = {each: file[each] for each in file.files}
+    return NamedSet(name=name, control_values=control_values, **document)
 
 
 def labels_digest(task: Task, reader: DatasetReader, slots: Integers) -> str:

@@ -33,7 +33,7 @@ class Task(ABC):
     columns: tuple[str, ...]
     """Of the table of results, besides the method and who entered it."""
     tolerances: ClassVar[Mapping[str, float]]
-    """Tolerances of the arrays of `seen` between two makings of one set."""
+    """Tolerances of the arrays of `control_values` between two makings of one set."""
 
     def labels(self, reader: DatasetReader, slots: Integers) -> list[dict[str, Any]]:
         """Return the slots and labels of samples as plain values; a category by its name."""
@@ -45,7 +45,7 @@ class Task(ABC):
         return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
     @abstractmethod
-    def seen(self, reader: DatasetReader, slots: Integers) -> dict[str, Array]:
+    def control_values(self, reader: DatasetReader, slots: Integers) -> dict[str, Array]:
         """Return a small part of the input of a method, and of a computed truth, for slots."""
 
     @abstractmethod
@@ -91,7 +91,7 @@ class ClothTask(Task):
     tolerances: ClassVar[Mapping[str, float]] = {"frames": 1.5}
     """In levels of 255, of means over 14 x 14 pixels."""
 
-    def seen(self, reader: DatasetReader, slots: Integers) -> dict[str, Array]:
+    def control_values(self, reader: DatasetReader, slots: Integers) -> dict[str, Array]:
         # A few frames inside the clip, and means of blocks: small, and equal on all machines.
         last = reader.arrays["video"].shape[0] - 1
         frames = np.linspace(0, last, _FRAMES + 2).round().astype(int)[1:-1]
@@ -156,7 +156,7 @@ class RodTask(Task):
     )
     tolerances: ClassVar[Mapping[str, float]] = {"centerline": 1e-5, "bending": 1e-3}
 
-    def seen(self, reader: DatasetReader, slots: Integers) -> dict[str, Array]:
+    def control_values(self, reader: DatasetReader, slots: Integers) -> dict[str, Array]:
         exact = reader.read("centerline", slots)
         return {
             "centerline": exact[:, ::_EVERY],

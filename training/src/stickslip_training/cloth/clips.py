@@ -386,9 +386,9 @@ def training_clips(
     numbers = {run: number for number, run in enumerate(runs)}
     clips = Clips.joined([clips_of_file(Path(source), train.materials)[0] for source in sources])
     places = [numbers.get(clip, -1) for clip in zip(clips.material, clips.mu, strict=True)]
-    if others := places.count(-1):
+    if unused := places.count(-1):
         raise ValueError(
-            f"clips must show simulations to train on or to validate: {others} of "
+            f"clips must show simulations to train on or to validate: {unused} of "
             f"{len(clips)} do not"
         )
     known = replace(clips, run=np.array(places))

@@ -328,8 +328,8 @@ class FrictionLearner(Learner):
             batch = self._rendered(self.settings.batch_size - blender_count, random, generator)
             if self.clips is not None and blender_count:
                 clips = random.integers(len(self.clips.train), size=blender_count)
-                others = self._composed(self.clips.train[clips], generator)
-                both = zip(batch, others, strict=True)
+                blender_batch = self._composed(self.clips.train[clips], generator)
+                both = zip(batch, blender_batch, strict=True)
                 batch = Batch(*(torch.cat(parts) for parts in both))
             if number < self.settled:
                 return batch._replace(silhouettes=pooled(batch.silhouettes))

@@ -53,13 +53,13 @@ def rotate_cameras(cameras: Cameras, azimuth: Tensor, elevation: Tensor) -> Came
     middle = cameras.translation.new_tensor(TURN_CENTER).expand(len(azimuth), 3)
     in_camera = (cameras.rotation @ middle[..., None])[..., 0] + cameras.translation
     zero = torch.zeros_like(azimuth)
-    one = torch.ones_like(azimuth)
+    unit = torch.ones_like(azimuth)
 
     # About the vertical axis of the world, and then about the horizontal axis of the camera.
     cos, sin = torch.cos(azimuth), torch.sin(azimuth)
-    around = torch.stack([cos, sin, zero, -sin, cos, zero, zero, zero, one], dim=-1)
+    around = torch.stack([cos, sin, zero, -sin, cos, zero, zero, zero, unit], dim=-1)
     cos, sin = torch.cos(elevation), torch.sin(elevation)
-    up = torch.stack([one, zero, zero, zero, cos, -sin, zero, sin, cos], dim=-1)
+    up = torch.stack([unit, zero, zero, zero, cos, -sin, zero, sin, cos], dim=-1)
     rotation = up.reshape(-1, 3, 3) @ cameras.rotation @ around.reshape(-1, 3, 3)
 
     # The middle of the scene stays in its place in the picture.

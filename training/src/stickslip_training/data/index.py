@@ -86,12 +86,12 @@ class Index:
         with self.contents() as contents:
             return contents.section(contents.number_of(slot))
 
-    def file(self, path: str, what: str) -> FileEntry:
-        """Return a file of the manifest; MissingFileError begins with `what`."""
+    def file(self, path: str, subject: str) -> FileEntry:
+        """Return a file of the manifest; MissingFileError begins with `subject`."""
         with self.contents() as contents:
             file = contents.file(path)
         if file is None:
-            raise MissingFileError(f"{what}: {path} is not in the manifest of {self.source}")
+            raise MissingFileError(f"{subject}: {path} is not in the manifest of {self.source}")
         return file
 
     def read_file(self, file: FileEntry) -> bytes:
@@ -174,20 +174,22 @@ class Index:
         if not array.per_sample:
             out[...] = self._kept_chunk(array, number)[position]
             return
-        what = f"array {array.name}, sample {slot}"
-        file = self.file(array.shard_path(number), what)
+        subject = f"array {array.name}, sample {slot}"
+        file = self.file(array.shard_path(number), subject)
         offset, length = map(int, self._shard_index(array, number, file)[position])
         if offset == codecs.MISSING and length == codecs.MISSING:
-            raise CorruptDataError(f"{what}: its chunk is missing in {self.at(file)}")
+            raise CorruptDataError(f"{subject}: its chunk is missing in {self.at(file)}")
         if offset + length > file.size:
-            raise CorruptDataError(f"{what}: its chunk reaches beyond the end of {self.at(file)}")
+            raise CorruptDataError(
+                f"{subject}: its chunk reaches beyond the end of {self.at(file)}"
+            )
         # A chunk is read whole, so its size must be one that the sample can have.
         if length > codecs.largest_chunk(out.nbytes):
             raise CorruptDataError(
-                f"{what}: its chunk has {length} bytes, more than {out.nbytes} can take"
+                f"{subject}: its chunk has {length} bytes, more than {out.nbytes} can take"
             )
         chunk = self.source.read(file, offset, length)
-        with _naming(f"{what}, {self.at(file)}"):
+        with _naming(f"{subject}, {self.at(file)}"):
             codecs.decode_sample(array, chunk, out)
 
     def _shard_index(self, array: ArrayLayout, shard: int, file: FileEntry) -> Array:
@@ -220,24 +222,24 @@ class Index:
         """Return the chunk that is all of a file, (samples per file, *sample shape)."""
         size = self.manifest.spec.samples_per_file(array)
         last = min((number + 1) * size, self.manifest.sample_count) - 1
-        what = f"array {array.name}, samples {number * size} to {last}"
-        file = self.file(array.shard_path(number), what)
+        subject = f"array {array.name}, samples {number * size} to {last}"
+        file = self.file(array.shard_path(number), subject)
         out = np.empty((size, *array.shape), dtype=array.dtype)
         # The size is checked before the file is read: memory follows from the layout.
         if file.size > codecs.largest_chunk(out.nbytes):
             raise CorruptDataError(
-                f"{what}: {self.at(file)} has {file.size} bytes, more than {out.nbytes} can take"
+                f"{subject}: {self.at(file)} has {file.size} bytes, more than {out.nbytes} can take"
             )
         data = self.read_file(file)
-        with _naming(f"{what}, {self.at(file)}"):
+        with _naming(f"{subject}, {self.at(file)}"):
             codecs.decode_chunk(data, out)
         return out
 
 
 @contextmanager
-def _naming(what: str) -> Iterator[None]:
+def _naming(subject: str) -> Iterator[None]:
     """Name the chunk that cannot be decoded."""
     try:
         yield
     except (codecs.CorruptChunkError, RuntimeError, ValueError) as error:
-        raise CorruptDataError(f"{what}: {error}") from error
+        raise CorruptDataError(f"{subject}: {error}") from error

@@ -73,9 +73,9 @@ def load_splits(reader: DatasetReader, evaluation_rods: int) -> tuple[dict[str, 
     if not len(slots["test"]):
         other = "validation" if len(slots["validation"]) else "train"
         slots["test"] = slots[other]
-        seen = "chose the weights" if other == "validation" else "trained the network"
+        purpose = "chose the weights" if other == "validation" else "trained the network"
         notes.append(
-            f"The test split is empty: errors are those on the {other} split, which {seen}."
+            f"The test split is empty: errors are those on the {other} split, which {purpose}."
         )
     if set(slots["test"]) & set(slots["train"]):
         notes.append("Test rods were trained on: these errors do not hold for other rods.")

@@ -61,8 +61,9 @@ def draw(scene: Mapping[str, Any], record: Mapping[str, Array], out: Path) -> li
     sheet = scene["sheet"]
     stage = Stage(scene["scene"], sheet, scene["segments"], record, picture)
     geometry = Geometry(record[f"{sheet}.triangles"], record[f"{sheet}.rest"], stage)
-    given = [Camera.model_validate(camera) for camera in scene["cameras"]]
-    cameras = [scaled(camera, SIDE / camera.width) for camera in given] or [
+    scene_cameras = [Camera.model_validate(camera) for camera in scene["cameras"]]
+    # Pictures stand side by side in the clip, so all of them have one height.
+    cameras = [scaled(camera, SIDE / camera.height) for camera in scene_cameras] or [
         stage.camera(name, geometry, (SIDE, SIDE)) for name in FRAMING
     ]
     colors = _colors(geometry)
@@ -108,14 +109,14 @@ def _drawn(
 ) -> npt.NDArray[np.uint8]:
     """Return a picture (height, width, 3) with flat shading, and with shadows on the floor."""
     window = Window(0, 0, camera.width, camera.height)
-    seen = see(projected(camera, points), geometry.triangles, window, _SHARPNESS).triangle
+    visible = see(projected(camera, points), geometry.triangles, window, _SHARPNESS).triangle
     a, b, c = (points[geometry.triangles[:, k]] for k in range(3))
     normals = np.cross(b - a, c - a)
     light = _LIGHT / np.linalg.norm(_LIGHT)
     facing = np.abs(normals @ light) / np.maximum(np.linalg.norm(normals, axis=1), 1e-30)
     shaded = colors * (1.0 - _DIFFUSE + _DIFFUSE * facing[:, None])
-    ground = _floor(geometry, points, camera, seen.shape, light)
-    picture = np.where(seen[..., None] < 0, ground[..., None], shaded[seen])
+    ground = _floor(geometry, points, camera, visible.shape, light)
+    picture = np.where(visible[..., None] < 0, ground[..., None], shaded[visible])
     small = picture.reshape(camera.height, _SHARPNESS, camera.width, _SHARPNESS, 3).mean(
         axis=(1, 3)
     )

@@ -33,7 +33,7 @@ if TYPE_CHECKING:  # content keys hold whole documents; the modules that define 
 ShadingArray = npt.NDArray[np.float16]
 """A linear shading, shape (frames, FINE height, FINE width, 3).
 
-The channels belong to the albedos of `shading.SHOWN`.
+The channels belong to the albedos of `shading.CAMERA_ALBEDOS`.
 """
 
 FRAME_MARGIN = 1.0
@@ -161,17 +161,17 @@ def check_rig(render: Render) -> None:
 
 
 def why_unfit(
-    what: str, points: Array, radius: float, cameras: tuple[Camera, ...]
+    thing: str, points: Array, radius: float, cameras: tuple[Camera, ...]
 ) -> TaskResult | None:
     """Return a rejection of points (..., 3) that cannot be rendered, or None.
 
     Such points are not finite, or they leave the frame of a camera.
     """
     if not np.isfinite(points).all():
-        return rejected(Reason.invalid_sample, f"the {what} has positions that are not finite")
+        return rejected(Reason.invalid_sample, f"the {thing} has positions that are not finite")
     overflow = {camera.name: camera.overflow(points, radius, FRAME_MARGIN) for camera in cameras}
     outside = [
-        f"the {what} leaves view {name} by {excess:.1f} px"
+        f"the {thing} leaves view {name} by {excess:.1f} px"
         for name, excess in overflow.items()
         if excess > 0.0
     ]

@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from stickslip_blender.cloth.shading import ELSEWHERE, FINE, SHOWN, TOLERANCE
+from stickslip_blender.cloth.shading import CAMERA_ALBEDOS, ELSEWHERE, FINE, TOLERANCE
 from stickslip_blender.raster import Window, _raster
 
-ALBEDOS = SHOWN[1], ELSEWHERE[1], ELSEWHERE[2]
+ALBEDOS = CAMERA_ALBEDOS[1], ELSEWHERE[1], ELSEWHERE[2]
 RANDOM = np.random.Generator(np.random.PCG64(0))
 
 
@@ -30,7 +30,7 @@ def test_composed_pictures_are_what_the_formula_says() -> None:
     light = np.stack(
         [
             gloss + here * a + twice * b * np.where(covered, a, 1.0)
-            for a, b in zip(SHOWN, ELSEWHERE, strict=True)
+            for a, b in zip(CAMERA_ALBEDOS, ELSEWHERE, strict=True)
         ],
         axis=-1,
     ).astype(np.float16)

@@ -13,12 +13,13 @@ from stickslip_blender.actor import RenderActor
 from stickslip_blender.cloth.looks import drawn_light, drawn_substrate
 from stickslip_blender.cloth.scene import ClothScene
 from stickslip_blender.cloth.textures import SIZE, custom_texture, texture_image
-from stickslip_schemas.documents.tasks import RenderOutput, TaskResult, input_digests, task_adapter
+from stickslip_schemas.documents.tasks import RenderOutput, input_digests, task_adapter
 from stickslip_schemas.format.codecs import decode_clip
 from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 from stickslip_schemas.spec.cameras import distorted, load_rig, rig_digest
 from stickslip_schemas.spec.names import Calibration, FloorNumbers, LampNumbers, Texture
 from stickslip_schemas.store import DirectoryStore
+from stickslip_testing.render_tasks import cloth_task, output_of
 
 Clip = npt.NDArray[np.uint8]
 
@@ -57,33 +58,6 @@ def _flag() -> Clip:
     return picture
 
 
-def _task(record: str, **look: Any) -> dict[str, Any]:
-    render = {
-        "kind": "cloth_drag",
-        "rig": "drag",
-        "rig_digest": rig_digest("drag"),
-        "material": "gray-interlock",
-        "texture": "plaid",
-        "viewpoint": "calibrated",
-        "instants": [0],
-        "quality": "preview",
-        "light_seed": 9,
-        "crease_seed": 4,
-    }
-    more = {"textures": look.pop("textures")} if "textures" in look else {}
-    return {
-        "stage": "render",
-        "render": render | look,
-        "record": {"digest": record, "row": 0},
-    } | more
-
-
-def _output(actor: RenderActor, task: dict[str, Any]) -> RenderOutput:
-    output = TaskResult.model_validate(actor.render(task)).output
-    assert isinstance(output, RenderOutput)
-    return output
-
-
 def _frame(store: DirectoryStore, output: RenderOutput, texture: str | None = None) -> Clip:
     chunk = (output if texture is None else output.clips[texture].output).chunks["video"]
     video = np.empty((1, 224, 224, 3), dtype=np.uint8)
@@ -102,7 +76,7 @@ def test_a_texture_of_the_users_own_is_printed_on_the_cloth(
 ) -> None:
     """Its upper edge is the held one. It shares its shading with textures that are built in."""
     image = f"sha256:{store.publish(_png(_flag()))}"
-    alone = _output(actor, _task(record, texture="my-flag", image=image))
+    alone = output_of(actor, cloth_task(record, texture="my-flag", image=image))
     frame = _frame(store, alone)
     red, blue = _colored(frame)
     assert red.sum() > 300
@@ -111,26 +85,26 @@ def test_a_texture_of_the_users_own_is_printed_on_the_cloth(
         np.nonzero(red)[0].mean() < np.nonzero(blue)[0].mean() - 10
     )  # the cloth hangs from its upper edge
     monkeypatch.setattr(ClothScene, "shading", None)  # from here on nothing can be traced
-    both = _output(actor, _task(record, textures=["dots", image]))
+    both = output_of(actor, cloth_task(record, textures=["dots", image]))
     assert both.clips[image].output == alone
     assert not np.array_equal(_frame(store, both, "dots"), frame)
 
 
 def test_a_task_says_which_pictures_it_reads(store: DirectoryStore, record: str) -> None:
     digest = store.publish(_png(_flag()))
-    own = _task(record, texture="my-flag", image=f"sha256:{digest}")
-    together = _task(record, textures=["dots", f"sha256:{digest}"])
+    own = cloth_task(record, texture="my-flag", image=f"sha256:{digest}")
+    together = cloth_task(record, textures=["dots", f"sha256:{digest}"])
     for task, expected in (
         (own, (record, digest)),
         (together, (record, digest)),
-        (_task(record), (record,)),
+        (cloth_task(record), (record,)),
     ):
         assert input_digests(task_adapter.validate_python(task), store.read) == expected
 
 
 def test_a_picture_that_is_gone_is_an_error(actor: RenderActor, record: str) -> None:
     with pytest.raises(FileNotFoundError):
-        actor.render(_task(record, texture="my-flag", image=f"sha256:{'0' * 64}"))
+        actor.render(cloth_task(record, texture="my-flag", image=f"sha256:{'0' * 64}"))
 
 
 def test_a_built_in_texture_as_a_file_is_the_texture() -> None:
@@ -165,9 +139,10 @@ def test_a_camera_of_the_users_own_sees_what_that_of_the_rig_sees(
     for name in ("fx", "fy", "cx", "cy", "rotation", "translation"):
         np.testing.assert_allclose(getattr(own, name), getattr(ours, name), atol=1e-9)
     seen = _frame(
-        store, _output(actor, _task(record, viewpoint="lab", camera=own.model_dump(mode="json")))
+        store,
+        output_of(actor, cloth_task(record, viewpoint="lab", camera=own.model_dump(mode="json"))),
     )
-    expected = _frame(store, _output(actor, _task(record, viewpoint="left")))
+    expected = _frame(store, output_of(actor, cloth_task(record, viewpoint="left")))
     assert (np.abs(seen.astype(int) - expected) > 2).mean() < 0.002
 
 
@@ -181,7 +156,9 @@ def test_a_lens_shows_what_the_straight_camera_sees_elsewhere(
     straight, seen = (
         _frame(
             store,
-            _output(actor, _task(record, viewpoint="lab", camera=camera.model_dump(mode="json"))),
+            output_of(
+                actor, cloth_task(record, viewpoint="lab", camera=camera.model_dump(mode="json"))
+            ),
         )
         for camera in (ours, bent)
     )
@@ -213,7 +190,7 @@ def test_lamps_and_floors_of_the_users_own(
         "substrate": "green-baize",
         "finish": floor.model_dump(),
     }
-    output = _output(actor, _task(record, **look))
+    output = output_of(actor, cloth_task(record, **look))
     labels = output.labels
     assert (labels["lighting"], labels["substrate"]) == ("bench", "green-baize")
     assert (labels["light"], labels["floor"]) == (light.numbers, ground.numbers)

@@ -13,10 +13,11 @@ from stickslip_blender.cloth import render_task
 from stickslip_blender.cloth.geometry import CLOTH
 from stickslip_blender.cloth.ground_truth import NOTHING, on_canvas
 from stickslip_blender.raster import Window, decoded
-from stickslip_schemas.documents.tasks import RenderOutput, TaskResult
+from stickslip_schemas.documents.tasks import RenderOutput
 from stickslip_schemas.format.codecs import decode_chunk, decode_clip
-from stickslip_schemas.spec.cameras import Camera, rig_cameras, rig_digest
+from stickslip_schemas.spec.cameras import Camera, rig_cameras
 from stickslip_schemas.store import DirectoryStore
+from stickslip_testing.render_tasks import cloth_task, output_of
 
 SIZES = [(640, 480), (128, 128), (1280, 720), (360, 640), (223, 131)]
 SIDE = 0.14
@@ -86,31 +87,6 @@ def _placed(rest: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     return np.column_stack([np.zeros(len(rest)), rest[:, 0], height])
 
 
-def _task(record: str, size: tuple[int, int], **look: Any) -> dict[str, Any]:
-    more = {"textures": look.pop("textures")} if "textures" in look else {}
-    render = {
-        "kind": "cloth_drag",
-        "rig": "drag",
-        "rig_digest": rig_digest("drag"),
-        "material": "gray-interlock",
-        "texture": "plaid",
-        "viewpoint": "calibrated",
-        "instants": [0],
-        "quality": "preview",
-        "light_seed": 9,
-        "crease_seed": 4,
-        "resolution": size,
-    }
-    record_row = {"digest": record, "row": 0}
-    return {"stage": "render", "render": render | look, "record": record_row} | more
-
-
-def _output(actor: RenderActor, task: dict[str, Any]) -> RenderOutput:
-    result = TaskResult.model_validate(actor.render(task))
-    assert isinstance(result.output, RenderOutput), result
-    return result.output
-
-
 def _frame(store: DirectoryStore, output: RenderOutput, size: tuple[int, int]) -> Any:
     chunk = output.chunks["video"]
     video = np.empty((1, size[1], size[0], 3), dtype=np.uint8)
@@ -147,8 +123,10 @@ def test_marks_are_where_their_labels_say(
 ) -> None:
     """White marks over white cloth under the same light: their share of each pixel."""
     marks, white = (f"sha256:{store.publish(_png(picture))}" for picture in _printed())
-    task = _task(record, size, texture="marks", image=marks, textures=[marks, white])
-    clips = _output(actor, task).clips
+    task = cloth_task(
+        record, resolution=size, texture="marks", image=marks, textures=[marks, white]
+    )
+    clips = output_of(actor, task).clips
     frames = [_frame(store, clips[name].output, size) for name in (marks, white)]
     shown, lit = (decoded(frame).astype(float).sum(axis=2) for frame in frames)
 
@@ -171,7 +149,9 @@ def test_masks_and_depth_are_those_of_the_projected_cloth(
     actor: RenderActor, store: DirectoryStore, record: str, size: tuple[int, int]
 ) -> None:
     width, height = size
-    output = _output(actor, _task(record, size, ground_truth=["depth", "segmentation"]))
+    output = output_of(
+        actor, cloth_task(record, resolution=size, ground_truth=["depth", "segmentation"])
+    )
     depth = _values(store, output, "depth", (height, width), "float32")
     cloth = _values(store, output, "segmentation", (height, width), "uint8") == CLOTH
     camera = _camera(size)
@@ -202,9 +182,9 @@ def test_a_smaller_picture_is_in_the_upper_left_of_its_frame(
 ) -> None:
     size = (160, 96)
     names = ["depth", "segmentation", "uv", "flow", "normals"]
-    alone = _output(actor, _task(record, size))
-    task = _task(record, size, canvas=(200, 131), ground_truth=names)
-    output = _output(actor, task)
+    alone = output_of(actor, cloth_task(record, resolution=size))
+    task = cloth_task(record, resolution=size, canvas=(200, 131), ground_truth=names)
+    output = output_of(actor, task)
     frame = _frame(store, output, (200, 131))
     assert np.array_equal(frame[:96, :160], _frame(store, alone, size))
     assert not frame[96:].any()
@@ -239,12 +219,14 @@ def test_bands_and_batches_change_no_picture(
     actor: RenderActor, store: DirectoryStore, record: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     textures = ["plaid", "dots", "checker", "stripes"]
-    task = _task(record, (223, 131), textures=textures, measured=1.0, substrate="ceramic")
-    whole = _output(actor, task)
+    task = cloth_task(
+        record, resolution=(223, 131), textures=textures, measured=1.0, substrate="ceramic"
+    )
+    whole = output_of(actor, task)
     monkeypatch.setattr("stickslip_blender.raster._BAND_SAMPLES", 40_000)
     monkeypatch.setattr("stickslip_blender.cloth.looks._FACTOR_PIXELS", 3_000)
     monkeypatch.setattr(render_task, "_BATCH_BYTES", 1)
-    parts = _output(RenderActor(str(store.root)), task)
+    parts = output_of(RenderActor(str(store.root)), task)
     for name in textures:
         first, second = whole.clips[name].output, parts.clips[name].output
         frames = [_frame(store, output, (223, 131)) for output in (first, second)]

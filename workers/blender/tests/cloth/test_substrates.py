@@ -13,7 +13,7 @@ from stickslip_blender.cloth.looks import (
     SOURCES,
     drawn_light,
     drawn_substrate,
-    fabric_look,
+    fabric_appearance,
     floor_factor,
     print_on_fabric,
 )
@@ -72,7 +72,7 @@ def test_fabrics_differ_in_their_grain(sheet: Any) -> None:
     surface = Surface(sheet.triangles, sheet.rest)
     white = np.full((256, 256, 3), 200, dtype=np.uint8)
     prints = {
-        material: print_on_fabric(white, fabric_look(material), surface) for material in LOOKS
+        material: print_on_fabric(white, fabric_appearance(material), surface) for material in LOOKS
     }
     assert len({picture.tobytes() for picture in prints.values()}) == len(prints)
     inner = {

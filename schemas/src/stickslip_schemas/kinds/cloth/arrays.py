@@ -280,13 +280,13 @@ def _tracks(spec: ClipSpec, scene: Scene) -> Iterator[ArrayLayout]:
     pose = {"row": 3, "column": 4}
 
     # Forces are on sheets, from bodies first and then from sheets.
-    others = [*bodies, *sheets]
+    partners = [*bodies, *sheets]
     yield over_time(
         spec,
         "contact_force",
         "force of bodies, then sheets, on each sheet [N]",
-        of={"sheet": len(sheets), "other": len(others), "xyz": 3},
-        attributes={"sheets": sheets, "others": others},
+        of={"sheet": len(sheets), "other": len(partners), "xyz": 3},
+        attributes={"sheets": sheets, "others": partners},
     )
     if bodies:
         yield over_time(

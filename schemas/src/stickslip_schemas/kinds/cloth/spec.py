@@ -304,7 +304,8 @@ class ClipSpec(JobSpec):
     def picture_size(self, viewpoint: str) -> tuple[int, int]:
         """Return width and height of the pictures of a viewpoint [px]."""
         meaning = self.meaning("viewpoint", viewpoint)
-        of_camera = meaning.resolution if isinstance(meaning, Calibration) else None
+        # Cameras of a rig, and those that frame what moves, have no definition.
+        of_camera = None if meaning is None else meaning.resolution
         return of_camera or self.resolution
 
     @property

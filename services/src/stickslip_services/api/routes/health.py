@@ -4,9 +4,9 @@ The queue and the store are read at each scrape; counters count since the start.
 """
 
 from collections import Counter as Counts
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from fastapi import APIRouter, Request, Response
 from prometheus_client import (
@@ -19,7 +19,7 @@ from prometheus_client import (
 )
 from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
-from sqlalchemy import func, select, text
+from sqlalchemy import Connection, func, select, text
 from stickslip_schemas.base import Document
 from stickslip_schemas.documents.worker_api import ReportAnswer, ReportBatch
 from stickslip_schemas.store import DirectoryStore, Store
@@ -37,11 +37,52 @@ from stickslip_services.queue.watch import MAX_IDLE_JOBS, idle_jobs, silent_work
 from stickslip_services.queue.workers import alive_workers
 
 
+class _Versions(NamedTuple):
+    """All complete dataset versions together."""
+
+    number: int
+    size: int | None
+    damaged: int | None
+    scrubbed_at: float | None
+
+
 class _QueueCollector(Collector):
     def __init__(self, context: Context) -> None:
         self._context = context
 
     def collect(self) -> Iterable[Metric]:
+        # One read transaction: all metrics of a scrape show the same moment.
+        with self._context.database.read() as connection:
+            now = self._context.clock()
+            return [
+                *self._queue_metrics(connection),
+                *self._worker_metrics(connection, now),
+                *self._store_metrics(connection, now),
+                *_warning_metrics(connection, now),
+            ]
+
+    def _queue_metrics(self, connection: Connection) -> Iterator[Metric]:
+        tasks = [(*key, count) for key, count in count_tasks(connection).items()]
+        yield _gauge("tasks", "Tasks of jobs by stage and state", tasks, "stage", "state")
+        states = select(jobs.c.state, func.count()).group_by(jobs.c.state)
+        yield _gauge("jobs", "Jobs by state", connection.execute(states).all(), "state")
+
+    def _worker_metrics(self, connection: Connection, now: float) -> Iterator[Metric]:
+        alive = alive_workers(self._context, connection)
+        leases = Counts(connection.scalars(select(tasks_.c.owner).where(IS_LEASED)).all())
+        by_worker = [(worker.name, leases[worker.id]) for worker in alive]
+        yield _gauge("leases", "Tasks on lease by worker", by_worker, "worker")
+        yield _gauge("workers", "Workers with a recent message", [(len(alive),)])
+        slots = sum(worker.condition.slots for worker in alive)
+        yield _gauge("worker_slots", "Slots of workers with a recent message", [(slots,)])
+        yield _gauge(
+            "worker_silent_seconds",
+            "Time since the last message of workers that were not stopped [s]",
+            silent_workers(connection, now),
+            "worker",
+        )
+
+    def _store_metrics(self, connection: Connection, now: float) -> Iterator[Metric]:
         columns = dataset_versions.c
         sums = (
             func.count(),
@@ -49,67 +90,22 @@ class _QueueCollector(Collector):
             func.sum(columns.damaged),
             func.min(columns.scrubbed_at),
         )
-        with self._context.database.read() as connection:
-            alive = alive_workers(self._context, connection)
-            tasks = [(*key, count) for key, count in count_tasks(connection).items()]
-            by_state = connection.execute(
-                select(jobs.c.state, func.count()).group_by(jobs.c.state)
-            ).all()
-            held = Counts(connection.scalars(select(tasks_.c.owner).where(IS_LEASED)).all())
-            count, size, bad, read_at = connection.execute(
-                select(*sums).where(columns.manifest.is_not(None))
-            ).one()
-            now = self._context.clock()
-            idle = idle_jobs(connection, now)
-            silent = silent_workers(connection, now)
-            expiring = keys_that_expire(connection, now)
+        complete = select(*sums).where(columns.manifest.is_not(None))
+        versions = _Versions(*connection.execute(complete).one())
+        yield _gauge("dataset_versions", "Dataset versions", [(versions.number,)])
+        size = versions.size or 0
+        yield _gauge("dataset_bytes", "Size of the files of all dataset versions", [(size,)])
+        damaged = versions.damaged or 0
+        yield _gauge("damaged_files", "Files that scrubbing found damaged", [(damaged,)])
         # Without a version there is nothing to scrub.
-        age = now - read_at if count else 0.0
-        return [
-            _gauge("tasks", "Tasks of jobs by stage and state", tasks, "stage", "state"),
-            _gauge("jobs", "Jobs by state", by_state, "state"),
-            _gauge(
-                "leases",
-                "Tasks on lease by worker",
-                [(worker.name, held[worker.id]) for worker in alive],
-                "worker",
-            ),
-            _gauge("workers", "Workers with a recent message", [(len(alive),)]),
-            _gauge(
-                "worker_slots",
-                "Slots of workers with a recent message",
-                [(sum(worker.condition.slots for worker in alive),)],
-            ),
-            _gauge("dataset_versions", "Dataset versions", [(count,)]),
-            _gauge("dataset_bytes", "Size of the files of all dataset versions", [(size or 0,)]),
-            _gauge("damaged_files", "Files that scrubbing found damaged", [(bad or 0,)]),
-            _gauge("unread_seconds", "Age of the oldest scrub of a version [s]", [(age,)]),
-            _gauge("disk_bytes", "Disks of store and database", self._disks(), "place", "state"),
-            _gauge(
-                "store_unavailable",
-                "Whether store or database take no results, and jobs are paused",
-                [(float(bool(self._context.store_watch.trouble)),)],
-            ),
-            _gauge(
-                "job_idle_seconds",
-                f"Time since the last progress of the {MAX_IDLE_JOBS} most idle active jobs [s]",
-                idle,
-                "job_id",
-            ),
-            _gauge(
-                "worker_silent_seconds",
-                "Time since the last message of workers that were not stopped [s]",
-                silent,
-                "worker",
-            ),
-            _gauge(
-                "key_seconds",
-                "Time until a key without a successor expires [s]",
-                [(key.id, key.name, key.expires_at - now) for key in expiring],
-                "key",
-                "name",
-            ),
-        ]
+        age = 0.0 if versions.scrubbed_at is None else now - versions.scrubbed_at
+        yield _gauge("unread_seconds", "Age of the oldest scrub of a version [s]", [(age,)])
+        yield _gauge("disk_bytes", "Disks of store and database", self._disks(), "place", "state")
+        yield _gauge(
+            "store_unavailable",
+            "Whether store or database take no results, and jobs are paused",
+            [(float(bool(self._context.store_watch.trouble)),)],
+        )
 
     def _disks(self) -> list[tuple[str, str, float]]:
         """Return the free and used bytes of each disk, once if store and database share one."""
@@ -125,6 +121,24 @@ class _QueueCollector(Collector):
             if usage is not None:
                 rows += [(name, "free", usage.free), (name, "used", usage.used)]
         return rows
+
+
+def _warning_metrics(connection: Connection, now: float) -> Iterator[Metric]:
+    """Yield the times after which somebody should look at a job or at a key."""
+    yield _gauge(
+        "job_idle_seconds",
+        f"Time since the last progress of the {MAX_IDLE_JOBS} most idle active jobs [s]",
+        idle_jobs(connection, now),
+        "job_id",
+    )
+    expiring = keys_that_expire(connection, now)
+    yield _gauge(
+        "key_seconds",
+        "Time until a key without a successor expires [s]",
+        [(key.id, key.name, key.expires_at - now) for key in expiring],
+        "key",
+        "name",
+    )
 
 
 def _on_one_disk(store: Path, data: Path) -> bool:

@@ -15,7 +15,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from stickslip_blender.cloth.looks import Look
+from stickslip_blender.cloth.looks import FabricAppearance
 from stickslip_blender.cloth.surface import surface
 from stickslip_blender.cycles.objects import SHARP
 from stickslip_blender.raster import Textures, decoded, fans
@@ -173,7 +173,7 @@ class Print:
     """Texture coordinates of the vertices in [0, 1], shape (n, 2)."""
     picture: npt.NDArray[np.uint8]
     """The picture with the grain of the fabric, 8-bit sRGB, shape (size, size, 3)."""
-    look: Look
+    look: FabricAppearance
 
 
 @dataclass(frozen=True)
@@ -198,8 +198,8 @@ class Prop:
     @cached_property
     def grey(self) -> float:
         """The albedo that Cycles sees: the mean of the colours, at least 0.01."""
-        given = self.colors if self.sheet is None else decoded(self.sheet.picture)
-        return max(float(given.mean()), 0.01)
+        colors = self.colors if self.sheet is None else decoded(self.sheet.picture)
+        return max(float(colors.mean()), 0.01)
 
     @property
     def tints(self) -> npt.NDArray[np.float32]:
@@ -329,8 +329,10 @@ class Geometry:
 
     def points(self, positions: npt.ArrayLike, instant: int) -> Array:
         """Return all vertices (V, 3) [m] for the solver's positions (V', 3) [m] at an instant."""
-        given = np.asarray(positions, dtype=np.float64)
-        return np.concatenate([self.surface(given), *self.surroundings.placed(instant, given)])
+        vertices = np.asarray(positions, dtype=np.float64)
+        return np.concatenate(
+            [self.surface(vertices), *self.surroundings.placed(instant, vertices)]
+        )
 
     def parts(self, points: Array) -> list[Array]:
         """Split all vertices (V, 3) into the vertices (n, 3) of the cloth and of each prop."""

@@ -95,23 +95,23 @@ def ground_truth(
     pinhole, rays, places = traced(camera)
     # Find the nearest triangle at the middle of each pixel. A lens moves the pixels.
     here = projected(pinhole, points)
-    seen = see(here, geometry.triangles, Window(0, 0, pinhole.width, pinhole.height), grid=1)
+    visible = see(here, geometry.triangles, Window(0, 0, pinhole.width, pinhole.height), grid=1)
     if pinhole is not camera:
-        seen = seen.looked_up(places)
-    values = seen.at_centers(np.concatenate([here[:, 2:], geometry.uv, following], axis=1))
+        visible = visible.looked_up(places)
+    values = visible.at_centers(np.concatenate([here[:, 2:], geometry.uv, following], axis=1))
 
     # Normals are smooth only within a skin. A sharp edge has a vertex for each of its sides.
-    skins = replace(seen, points=here[geometry.shaded], triangles=geometry.shaded_triangles)
+    skins = replace(visible, points=here[geometry.shaded], triangles=geometry.shaded_triangles)
     smooth = skins.at_centers(_raster.normals(points[geometry.shaded], geometry.shaded_triangles))
-    thing = seen.triangle >= 0
-    cloth = thing & geometry.has_uv[seen.triangle]
+    thing = visible.triangle >= 0
+    cloth = thing & geometry.has_uv[visible.triangle]
 
     # The floor has no triangles. It is visible in pixels without any other object.
     floor = _floor_depth(camera, rays, geometry.surroundings.floor)
     pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
     moved, _ = camera.project(values[..., 3:6])
     segmentation = np.where(np.isfinite(floor), geometry.surroundings.ground, BACKGROUND)
-    segmentation[thing] = geometry.segments[seen.triangle[thing]]
+    segmentation[thing] = geometry.segments[visible.triangle[thing]]
 
     # Turn the normals into the axes of the camera and towards it, because cloth has two sides.
     normal = np.where(thing[..., None], smooth, (0.0, 0.0, 1.0)) @ np.asarray(camera.rotation).T

@@ -31,7 +31,7 @@ WHITE = 0.85  # largest albedo: no fabric scatters more, and grain shows on a wh
 
 
 @dataclass(frozen=True)
-class Look:
+class FabricAppearance:
     """The look of one fabric."""
 
     roughness: float
@@ -59,8 +59,10 @@ def _table(name: str) -> dict[str, Any]:
     )
 
 
-LOOKS = {material: Look(**numbers) for material, numbers in _table("fabrics.toml").items()}
-PLAIN = Look(
+LOOKS = {
+    material: FabricAppearance(**numbers) for material, numbers in _table("fabrics.toml").items()
+}
+PLAIN = FabricAppearance(
     roughness=0.85,
     specular=0.2,
     sheen=0.15,
@@ -72,13 +74,13 @@ PLAIN = Look(
 """Look of a fabric that is not in fabrics.toml, for example a custom one."""
 
 
-def fabric_look(material: str) -> Look:
+def fabric_appearance(material: str) -> FabricAppearance:
     """Return the look of a material, or `PLAIN` for a custom one."""
     return LOOKS.get(material, PLAIN)
 
 
 def print_on_fabric(
-    picture: npt.NDArray[np.uint8], look: Look, surface: Surface
+    picture: npt.NDArray[np.uint8], look: FabricAppearance, surface: Surface
 ) -> npt.NDArray[np.uint8]:
     """Return a texture (size, size, 3), 8-bit sRGB, printed on a sheet.
 

@@ -144,15 +144,15 @@ def landed_top(geometry: Geometry) -> float:
 
 def regions(geometry: Geometry, points: Floats, camera: Camera) -> npt.NDArray[np.bool_]:
     """Return the cloth, landed cloth, and the band along its edge, (3, height, width)."""
-    seen = see(
+    visible = see(
         projected(camera, points),
         geometry.triangles,
         Window(0, 0, camera.width, camera.height),
         grid=1,
     )
     # The triangles of the cloth come first. A prop in front of the cloth takes its pixels.
-    cloth = (seen.triangle >= 0) & (seen.triangle < geometry.cloth_triangles)
-    low = seen.at_centers(points[:, 2:])[..., 0] < landed_top(geometry)
+    cloth = (visible.triangle >= 0) & (visible.triangle < geometry.cloth_triangles)
+    low = visible.at_centers(points[:, 2:])[..., 0] < landed_top(geometry)
     return np.stack([cloth, cloth & low, _grown(cloth, BAND) & _grown(~cloth, BAND)])
 
 
@@ -170,7 +170,7 @@ def errors(picture: npt.NDArray[np.uint8], references: npt.NDArray[Any], channel
     Pixels that no pair of renderings shows have 0.
     """
     levels = picture[..., 1]
-    others = references[..., channel]
+    channel_light = references[..., channel]
     light = decoded(levels).astype(np.float64)
 
     # The slope of the sRGB curve turns differences of light into differences of levels.
@@ -178,8 +178,8 @@ def errors(picture: npt.NDArray[np.uint8], references: npt.NDArray[Any], channel
         light <= 0.0031308, 12.92, 1.055 / 2.4 * np.maximum(light, 0.0031308) ** (1.0 / 2.4 - 1.0)
     )
     top = np.where(levels == 255, 1.0, np.inf)  # brighter light has no other level
-    renderings = np.isfinite(others).sum(axis=0)
-    difference = np.nan_to_num(light - np.minimum(others, top))
+    renderings = np.isfinite(channel_light).sum(axis=0)
+    difference = np.nan_to_num(light - np.minimum(channel_light, top))
 
     # Sum the products over all pairs of different renderings: the square of the sum less the
     # squares. The product of a rendering with itself would contain the square of its noise.

@@ -9,8 +9,8 @@ import numpy.typing as npt
 from stickslip_schemas.spec.cameras import Camera
 
 from stickslip_blender.cloth.geometry import Geometry
-from stickslip_blender.cloth.looks import Light, Look, Substrate
-from stickslip_blender.cloth.shading import ELSEWHERE, FINE, SHOWN, Composer
+from stickslip_blender.cloth.looks import FabricAppearance, Light, Substrate
+from stickslip_blender.cloth.shading import CAMERA_ALBEDOS, ELSEWHERE, FINE, Composer
 from stickslip_blender.cycles.engine import ClothSampling, Sampling, new_scene, set_sampling
 from stickslip_blender.cycles.objects import (
     Fabric,
@@ -89,7 +89,7 @@ class ClothScene:
         camera: Camera,
         light: Light,
         substrate: Substrate,
-        look: Look,
+        look: FabricAppearance,
         track: Points,
         *,
         enlargement: float = 1.0,
@@ -130,7 +130,7 @@ class ClothScene:
         The shape is (FINE height, FINE width, 3). `seed` sets the noise. All frames of a clip have
         the same seed, so the remaining noise does not flicker.
         """
-        self._fabric.set_color(SHOWN, ELSEWHERE)
+        self._fabric.set_color(CAMERA_ALBEDOS, ELSEWHERE)
         self._place(points)
 
         # Render the whole frame with few paths, because light on the floor varies slowly.
@@ -188,7 +188,7 @@ def _blend_weights(low: int, high: int, size: int, ramp: int) -> npt.NDArray[np.
     return np.asarray(step * step * (3.0 - 2.0 * step), dtype=np.float32)
 
 
-def _shader(look: Look) -> dict[str, float]:
+def _shader(look: FabricAppearance) -> dict[str, float]:
     """Return the numbers of a look that the shader of a fabric takes."""
     return {
         name: getattr(look, name) for name in ("roughness", "specular", "sheen", "translucency")

@@ -1,8 +1,8 @@
 """One shading for many textures.
 
-The cloth is rendered once with the base colours SHOWN and ELSEWHERE. Lamp and floor are grey, so
-red, green and blue are three samples of the light that a pixel sends to the camera. This light is a
-function of the cloth's albedo at the pixel, a, and elsewhere, m:
+The cloth is rendered once with the base colours CAMERA_ALBEDOS and ELSEWHERE. Lamp and floor are
+grey, so red, green and blue are three samples of the light that a pixel sends to the camera. This
+light is a function of the cloth's albedo at the pixel, a, and elsewhere, m:
 
     L(a, m) = S + (D + I m) a
 
@@ -36,8 +36,8 @@ from stickslip_blender.cloth.looks import Substrate
 from stickslip_blender.raster import (
     GRID,
     Albedo,
-    Seen,
     Textures,
+    VisibleTriangles,
     Window,
     _raster,
     albedo_of_window,
@@ -49,7 +49,7 @@ from stickslip_blender.raster import (
     window_about,
 )
 
-SHOWN = (0.0, 0.6, 0.6)
+CAMERA_ALBEDOS = (0.0, 0.6, 0.6)
 ELSEWHERE = (0.3, 0.3, 0.05)
 """Base colours of the cloth in a shading, for rays of the camera and for other rays."""
 
@@ -117,7 +117,7 @@ class Composer:
             )
         _raster.compose(
             np.ascontiguousarray(shading).view(np.uint16),
-            (SHOWN[1], *ELSEWHERE[1:]),
+            (CAMERA_ALBEDOS[1], *ELSEWHERE[1:]),
             sight.overall.ravel(),
             sight.coverage,
             sight.mean.reshape(*sight.coverage.shape, colors),
@@ -172,12 +172,12 @@ class Composer:
 
         # The colour of bodies and holders is the mean over the samples of a pixel.
         props = np.ascontiguousarray(geometry.triangles[geometry.cloth_triangles :])
-        seen = see(projections, props, window, _PROP_GRID)
+        visible = see(projections, props, window, _PROP_GRID)
         samples = [
-            seen.triangle[row::_PROP_GRID, column::_PROP_GRID]
+            visible.triangle[row::_PROP_GRID, column::_PROP_GRID]
             for row, column in product(range(_PROP_GRID), repeat=2)
         ]
-        shown = sum(
+        tint = sum(
             (geometry.tints[sample] for sample in samples), np.zeros(1, dtype=np.float32)
         ) / len(samples)
 
@@ -186,17 +186,17 @@ class Composer:
         for sheet in geometry.printed:
             count = sheet.triangles.stop - sheet.triangles.start
             first = sheet.triangles.start
-            turned = np.where(seen.triangle < 0, -1, (seen.triangle - first) % len(props)).astype(
-                np.int32
-            )
-            rolled = replace(seen, triangles=np.roll(props, -first, axis=0), triangle=turned)
+            turned = np.where(
+                visible.triangle < 0, -1, (visible.triangle - first) % len(props)
+            ).astype(np.int32)
+            rolled = replace(visible, triangles=np.roll(props, -first, axis=0), triangle=turned)
             sight = see_albedo(rolled, geometry.uv, sheet.textures, count)
-            shown = shown + sight.coverage[..., None] * sight.mean[:, :, 0] / np.float32(sheet.grey)
+            tint = tint + sight.coverage[..., None] * sight.mean[:, :, 0] / np.float32(sheet.grey)
 
         # A prop hides the floor, as far as it covers a pixel.
         factor = floor.copy()
         factor[window.slices] = (
-            shown + (1.0 - seen.share_below(len(props))[..., None]) * factor[window.slices]
+            tint + (1.0 - visible.share_below(len(props))[..., None]) * factor[window.slices]
         )
         return factor
 
@@ -245,10 +245,12 @@ class Composer:
         # The distance of the image behind the floor decides how far a rough floor blurs it. The
         # edge of the cloth has no depth, so take the mean around it.
         beyond = _beyond_floor(see(below, self._geometry.triangles, window, 1), camera, floor)
-        shown = sight.coverage[..., None]
+        coverage_of_image = sight.coverage[..., None]
         wide = np.full(beyond.shape, _PATH_BLUR * enlargement, dtype=np.float32)
         around = _raster.blurred(
-            np.concatenate([shown, shown * beyond[..., None]], axis=2), wide, wide
+            np.concatenate([coverage_of_image, coverage_of_image * beyond[..., None]], axis=2),
+            wide,
+            wide,
         )
         path = np.clip(around[..., 1] / np.maximum(around[..., 0], np.float32(1e-6)), 0.0, 1.0)
 
@@ -262,8 +264,8 @@ class Composer:
 
         # Blur coverage and colour alike. Their ratio is the colour. In places with hardly any
         # mirrored cloth, the mean colour takes its part.
-        flat = (shown[..., None] * sight.mean).reshape(*beyond.shape, -1)
-        blurred = _raster.blurred(np.concatenate([shown, flat], axis=2), down, across)
+        flat = (coverage_of_image[..., None] * sight.mean).reshape(*beyond.shape, -1)
+        blurred = _raster.blurred(np.concatenate([coverage_of_image, flat], axis=2), down, across)
         coverage = blurred[..., :1]
         confidence = np.minimum(coverage / _SURE_COVERAGE, 1.0)
         color = blurred[..., 1:] / np.maximum(coverage, 1e-6)
@@ -271,13 +273,13 @@ class Composer:
         return (mean + confidence * (color - mean)).astype(np.float32), window
 
 
-def _beyond_floor(seen: Seen, camera: Camera, height: float) -> Floats:
+def _beyond_floor(visible: VisibleTriangles, camera: Camera, height: float) -> Floats:
     """Return the distance of a mirrored thing behind the floor, over its depth.
 
     The shape is (height, width). A pixel without a mirror image has 0.
     """
-    depth = seen.at_centers(seen.points[:, 2:])[..., 0]
-    window = seen.window
+    depth = visible.at_centers(visible.points[:, 2:])[..., 0]
+    window = visible.window
     rows, columns = np.mgrid[window.top : window.bottom, window.left : window.right]
     ray = np.stack(
         [(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones(rows.shape)],

@@ -27,7 +27,7 @@ from stickslip_blender.cloth.geometry import (
     square,
     tiled,
 )
-from stickslip_blender.cloth.looks import fabric_look, print_on_fabric
+from stickslip_blender.cloth.looks import fabric_appearance, print_on_fabric
 from stickslip_blender.cloth.surface import surface
 from stickslip_blender.raster import Window, _raster, projected, see
 
@@ -145,11 +145,14 @@ class Stage:
         # would surprise.
         reduction = _THUMB / min(size)
         thumb = (round(reduction * size[0]), round(reduction * size[1]))
-        shown = [
-            _shown(framed(name, points, size=thumb, turn=turn), geometry, scenes) for turn in _TURNS
+        pixel_counts = [
+            _count_sheet_pixels(framed(name, points, size=thumb, turn=turn), geometry, scenes)
+            for turn in _TURNS
         ]
         turn = next(
-            turn for turn, seen in zip(_TURNS, shown, strict=True) if seen >= _ENOUGH * max(shown)
+            turn
+            for turn, pixel_count in zip(_TURNS, pixel_counts, strict=True)
+            if pixel_count >= _ENOUGH * max(pixel_counts)
         )
         return framed(name, points, size=size, turn=turn)
 
@@ -157,16 +160,18 @@ class Stage:
         self,
         name: str,
         sheet: Mapping[str, Any],
-        own: Mapping[str, Any] | None,
+        print_document: Mapping[str, Any] | None,
         picture: Any,
         segment: int,
     ) -> Prop:
         positions = self._record[f"{name}.positions"]
         skin = surface(self._record[f"{name}.triangles"], self._record[f"{name}.rest"])
-        look = fabric_look(sheet["material"])
+        look = fabric_appearance(sheet["material"])
         skin.apply_relief(hem=1e-3 * look.hem)
         texture = (
-            np.full((64, 64, 3), PLAIN, dtype=np.uint8) if own is None else picture(own["texture"])
+            np.full((64, 64, 3), PLAIN, dtype=np.uint8)
+            if print_document is None
+            else picture(print_document["texture"])
         )
         self._placers.append(lambda instant: skin(positions[instant]))
         faces = list(map(tuple, skin.triangles.tolist()))
@@ -219,9 +224,9 @@ class Stage:
 
 def _sunk(points: Array, triangles: Array) -> Array:
     """Return the vertices (n, 3) of a mesh, moved inwards by `SUNK`."""
-    given = np.asarray(points, dtype=np.float64)
+    vertices = np.asarray(points, dtype=np.float64)
     return np.asarray(
-        given - SUNK * _raster.normals(given, np.ascontiguousarray(triangles, dtype=np.int32))
+        vertices - SUNK * _raster.normals(vertices, np.ascontiguousarray(triangles, dtype=np.int32))
     )
 
 
@@ -238,11 +243,11 @@ def _shape(body: Mapping[str, Any]) -> tuple[Array, Faces]:
     return rounded((0.0, 0.0, half), body["radius"] - SUNK)
 
 
-def _shown(camera: Camera, geometry: Geometry, scenes: list[Array]) -> int:
+def _count_sheet_pixels(camera: Camera, geometry: Geometry, scenes: list[Array]) -> int:
     """Return the number of pixels that show the sheet, over several instants."""
     window = Window(0, 0, camera.width, camera.height)
     count = 0
     for points in scenes:
-        seen = see(projected(camera, points), geometry.triangles, window, grid=1).triangle
-        count += int(((seen >= 0) & (seen < geometry.cloth_triangles)).sum())
+        visible = see(projected(camera, points), geometry.triangles, window, grid=1).triangle
+        count += int(((visible >= 0) & (visible < geometry.cloth_triangles)).sum())
     return count

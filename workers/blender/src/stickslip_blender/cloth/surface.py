@@ -147,7 +147,7 @@ def surface(triangles: npt.ArrayLike, rest: npt.ArrayLike) -> "Surface":
     """
     faces = np.asarray(triangles, dtype=np.int32)
     flat = np.asarray(rest, dtype=np.float64)
-    return copy(_made(faces.tobytes(), flat.tobytes()))
+    return copy(_cached_surface(faces.tobytes(), flat.tobytes()))
 
 
 class Surface:
@@ -229,7 +229,7 @@ class Surface:
 
 
 @lru_cache(maxsize=16)
-def _made(triangles: bytes, rest: bytes) -> Surface:
+def _cached_surface(triangles: bytes, rest: bytes) -> Surface:
     return Surface(
         np.frombuffer(triangles, dtype=np.int32).reshape(-1, 3), np.frombuffer(rest).reshape(-1, 2)
     )

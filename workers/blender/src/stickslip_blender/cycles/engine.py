@@ -108,7 +108,7 @@ def described() -> dict[str, Any]:
         return {"device": CPU}
     return {
         "device": device(),
-        "names": sorted({found.name for found in _find_devices()}),
+        "names": sorted({device.name for device in _find_devices()}),
         "driver": _driver(),
     }
 
@@ -126,13 +126,13 @@ def _find_devices() -> list[Any]:
     preferences.refresh_devices()
     for each in preferences.devices:
         each.use = each.type == sort
-    found = [each for each in preferences.devices if each.type == sort]
-    if not found:
+    devices = [each for each in preferences.devices if each.type == sort]
+    if not devices:
         raise NoDeviceError(
             f"{VARIABLE} is {device()!r}, and Cycles finds no such device here: install its "
             f"driver, or unset {VARIABLE}"
         )
-    return found
+    return devices
 
 
 def _driver() -> str:

@@ -81,8 +81,8 @@ def set_roughness(shader: Any, roughness: float) -> None:
     if softened is None:
         softened = tree.nodes.new("ShaderNodeMapRange")
         softened.name = "softened"
-        seen = tree.nodes.new("ShaderNodeLightPath").outputs["Is Camera Ray"]
-        tree.links.new(seen, softened.inputs["Value"])
+        is_camera_ray = tree.nodes.new("ShaderNodeLightPath").outputs["Is Camera Ray"]
+        tree.links.new(is_camera_ray, softened.inputs["Value"])
         tree.links.new(softened.outputs["Result"], shader.inputs["Roughness"])
     set_inputs(softened, To_Min=max(roughness, SOFT), To_Max=roughness)
 
@@ -131,10 +131,10 @@ class Fabric:
         self._tree = tree = mesh.materials[0].node_tree
         self._picture = tree.nodes.new("ShaderNodeTexImage")
         self._picture.extension = "EXTEND"
-        self._shown, self._other = (
+        self._camera_color, self._ray_color = (
             tree.nodes.new("ShaderNodeRGB").outputs["Color"] for _ in range(2)
         )
-        self._even = mix_by_ray(tree, self._other, self._shown)
+        self._even = mix_by_ray(tree, self._ray_color, self._camera_color)
         self._color = tree.nodes.new("NodeReroute")
         through = tree.nodes.new("ShaderNodeBsdfTranslucent")
         self._both = tree.nodes.new("ShaderNodeMixShader")
@@ -159,8 +159,8 @@ class Fabric:
 
         Rays that do not come from the camera may see another colour.
         """
-        self._shown.default_value = (*color, 1.0)
-        self._other.default_value = (*(other or color), 1.0)
+        self._camera_color.default_value = (*color, 1.0)
+        self._ray_color.default_value = (*(other or color), 1.0)
         self._connect(self._even)
 
     def set_picture(self, picture: npt.NDArray[np.uint8]) -> None:
@@ -183,7 +183,7 @@ class Fabric:
             self._from = color
 
 
-def mix_by_ray(tree: Any, other: Any, seen: Any) -> Any:
+def mix_by_ray(tree: Any, ray_color: Any, camera_color: Any) -> Any:
     """Return the socket of a colour: `seen` for rays of the camera, `other` for the rest."""
     mix = tree.nodes.new("ShaderNodeMix")
     mix.data_type = "RGBA"
@@ -191,8 +191,8 @@ def mix_by_ray(tree: Any, other: Any, seen: Any) -> Any:
     sockets = {socket.identifier: socket for socket in mix.inputs}
     factor, a, b = (sockets[identifier] for identifier in _MIX_INPUTS)
     tree.links.new(tree.nodes.new("ShaderNodeLightPath").outputs["Is Camera Ray"], factor)
-    tree.links.new(other, a)
-    tree.links.new(seen, b)
+    tree.links.new(ray_color, a)
+    tree.links.new(camera_color, b)
     return next(o for o in mix.outputs if o.identifier == "Result_Color")
 
 

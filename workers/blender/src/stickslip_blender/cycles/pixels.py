@@ -62,26 +62,26 @@ def read_exr(data: bytes, wanted: str) -> npt.NDArray[np.float16]:
 
 def _attributes(data: bytes) -> tuple[dict[str, bytes], int]:
     """Return the values of the header's attributes by name, and the end of the header."""
-    found: dict[str, bytes] = {}
+    values: dict[str, bytes] = {}
     at = 8
     while data[at] != 0:
         name, at = _word(data, at)
         _, at = _word(data, at)
         (size,) = struct.unpack_from("<i", data, at)
-        found[name] = data[at + 4 : at + 4 + size]
+        values[name] = data[at + 4 : at + 4 + size]
         at += 4 + size
-    return found, at + 1
+    return values, at + 1
 
 
 def _channels(data: bytes) -> list[tuple[str, int]]:
     """Return the names and pixel types of a channel list, in the order of the file."""
-    found: list[tuple[str, int]] = []
+    channels: list[tuple[str, int]] = []
     at = 0
     while data[at] != 0:
         name, at = _word(data, at)
-        found.append((name, struct.unpack_from("<i", data, at)[0]))
+        channels.append((name, struct.unpack_from("<i", data, at)[0]))
         at += 16  # type, linearity and sampling
-    return found
+    return channels
 
 
 def _word(data: bytes, at: int) -> tuple[str, int]:

@@ -74,7 +74,7 @@ class Window:
 
 
 @dataclass(frozen=True)
-class Seen:
+class VisibleTriangles:
     """The triangle that each sample of a window sees."""
 
     points: Points
@@ -102,7 +102,7 @@ class Seen:
         )
         return share
 
-    def looked_up(self, places: Points) -> "Seen":
+    def looked_up(self, places: Points) -> "VisibleTriangles":
         """Return the view at positions (height, width, 2) [px] of the frame, with a grid of 1.
 
         Each position gets the triangle of the nearest sample.
@@ -120,15 +120,15 @@ class Seen:
             raise ValueError(
                 f"grid must be 1, a sample in the middle of each pixel; got {self.grid}"
             )
-        given = np.asarray(values, dtype=np.float64)
-        result = np.full((*self.triangle.shape, given.shape[1]), fill)
+        vertex_values = np.asarray(values, dtype=np.float64)
+        result = np.full((*self.triangle.shape, vertex_values.shape[1]), fill)
         rows, columns = np.nonzero(self.triangle >= 0)
         corners = self.triangles[self.triangle[rows, columns]]
         middles = np.column_stack([columns + self.window.left, rows + self.window.top])
         place = middles if self.places is None else self.places[rows, columns]
         weights = barycentric(self.points[corners][..., :2], place) / self.points[corners][..., 2]
         weights /= weights.sum(axis=1, keepdims=True)
-        result[rows, columns] = np.einsum("nk,nkx->nx", weights, given[corners])
+        result[rows, columns] = np.einsum("nk,nkx->nx", weights, vertex_values[corners])
         return result
 
 
@@ -190,7 +190,7 @@ def fans(faces: Sequence[Sequence[int]]) -> Indices:
     return np.array(triangles, dtype=np.int32)
 
 
-def see(points: Points, triangles: Indices, window: Window, grid: int = GRID) -> Seen:
+def see(points: Points, triangles: Indices, window: Window, grid: int = GRID) -> VisibleTriangles:
     """Find the nearest of the triangles (T, 3) of projected points at each sample of a window.
 
     A triangle that reaches behind the camera is invisible.
@@ -201,7 +201,7 @@ def see(points: Points, triangles: Indices, window: Window, grid: int = GRID) ->
         triangles = np.where(
             behind[triangles].any(axis=1, keepdims=True), triangles[:1, :1], triangles
         )
-    return Seen(
+    return VisibleTriangles(
         points, triangles, window, grid, _raster.visible(points, triangles, window.place, grid)
     )
 
@@ -239,13 +239,17 @@ class Albedo:
     """Sum of the areas of the cloth's triangles, each without the others in front [pixels]."""
 
 
-def see_albedo(seen: Seen, uv: npt.NDArray[np.float64], textures: Textures, cloth: int) -> Albedo:
+def see_albedo(
+    visible: VisibleTriangles, uv: npt.NDArray[np.float64], textures: Textures, cloth: int
+) -> Albedo:
     """Average the textures over the visible part of the first `cloth` triangles.
 
     `uv` are texture coordinates (V, 2) in [0, 1].
     """
-    packed = textures.texels, textures.count, seen.window.place, seen.grid
-    return Albedo(*_raster.albedo(seen.triangle, seen.points, seen.triangles, uv, cloth, *packed))
+    packed = textures.texels, textures.count, visible.window.place, visible.grid
+    return Albedo(
+        *_raster.albedo(visible.triangle, visible.points, visible.triangles, uv, cloth, *packed)
+    )
 
 
 def albedo_of_window(
@@ -264,8 +268,8 @@ def albedo_of_window(
     """
     sights: list[Albedo] = []
     for band in window.bands(grid):
-        seen = see(points, triangles, band, grid)
-        sights.append(see_albedo(seen, uv, textures, cloth))
+        visible = see(points, triangles, band, grid)
+        sights.append(see_albedo(visible, uv, textures, cloth))
     if len(sights) == 1:
         return sights[0]
     # The mean of all visible cloth is that of the bands, by the samples that see cloth.

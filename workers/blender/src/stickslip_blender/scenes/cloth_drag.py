@@ -13,6 +13,6 @@ if TYPE_CHECKING:
     from stickslip_schemas.kinds.cloth_drag import ClothDragRender
 
 
-def render(look: ClothDragRender, task: RenderTask, context: RenderContext) -> TaskResult:
+def render(appearance: ClothDragRender, task: RenderTask, context: RenderContext) -> TaskResult:
     """Render the clips of a drag."""
-    return render_clips(look, task, context, Holders)
+    return render_clips(appearance, task, context, Holders)

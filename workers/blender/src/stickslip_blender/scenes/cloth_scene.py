@@ -16,18 +16,20 @@ if TYPE_CHECKING:
     from stickslip_schemas.kinds.cloth_scene import ClothSceneRender
 
 
-def render(look: ClothSceneRender, task: RenderTask, context: RenderContext) -> TaskResult:
+def render(appearance: ClothSceneRender, task: RenderTask, context: RenderContext) -> TaskResult:
     """Render the clips of a scene."""
-    sheet = look.scene.textured
-    scene = look.scene.model_dump(mode="json")
+    sheet = appearance.scene.textured
+    scene = appearance.scene.model_dump(mode="json")
     record = context.record(task.record)
-    stage = Stage(scene, sheet, look.segments, record, lambda name: picture(name, context))
+    stage = Stage(scene, sheet, appearance.segments, record, lambda name: picture(name, context))
 
     def frame(geometry: Geometry) -> Camera:
         return (
-            stage.camera(look.viewpoint, geometry, look.resolution)
-            if look.rig is None
-            else rig_camera(look)
+            stage.camera(appearance.viewpoint, geometry, appearance.resolution)
+            if appearance.rig is None
+            else rig_camera(appearance)
         )
 
-    return render_clips(look, task, context, lambda _rest: stage, sheet=f"{sheet}.", frame=frame)
+    return render_clips(
+        appearance, task, context, lambda _rest: stage, sheet=f"{sheet}.", frame=frame
+    )

@@ -198,10 +198,10 @@ class RodRenderer:
         points = projected(camera, vertices)
         window = window_about(points, camera)
         if window.area:
-            seen = see(points, self._triangles, window)
+            visible = see(points, self._triangles, window)
             light = self._reader.read_matte(window).astype(np.float32)
             frame[window.slices] = encode(
-                self._before_ground(light, seen.share_below(len(self._triangles)))
+                self._before_ground(light, visible.share_below(len(self._triangles)))
             )
         return frame
 
@@ -236,18 +236,20 @@ class RodRenderer:
         return np.asarray(alpha * mean + (1.0 - alpha) * np.float32(GROUND), dtype=np.float32)
 
 
-def render(look: RodHangRender, task: RenderTask, context: RenderContext) -> TaskResult:
+def render(appearance: RodHangRender, task: RenderTask, context: RenderContext) -> TaskResult:
     """Render the views of a rod."""
-    cameras = rig_cameras(look.rig, look.resolution)
+    cameras = rig_cameras(appearance.rig, appearance.resolution)
     line = context.record(task.record)["centerline"]
-    if rejected := why_unfit("rod", line, look.radius, cameras):
+    if rejected := why_unfit("rod", line, appearance.radius, cameras):
         return rejected
-    color = silicone_color(look.color_seed)
+    color = silicone_color(appearance.color_seed)
     renderer = context.renderer(
-        ("rod_hang", look.quality), lambda: RodRenderer(quality=look.quality)
+        ("rod_hang", appearance.quality), lambda: RodRenderer(quality=appearance.quality)
     )
     # The seed of the colour is also the seed of the noise, so rods of a dataset differ in both.
-    views = renderer.render(line, cameras, color=color, radius=look.radius, seed=look.color_seed)
+    views = renderer.render(
+        line, cameras, color=color, radius=appearance.radius, seed=appearance.color_seed
+    )
     preview = (
         context.store.publish(png(np.concatenate(list(views), axis=1))) if task.preview else None
     )

@@ -12,7 +12,7 @@ from starlette.concurrency import run_in_threadpool
 from stickslip_schemas.base import sha256
 from stickslip_schemas.documents.problems import ProblemCode
 from stickslip_schemas.documents.responses import JobDetail, Validation
-from stickslip_schemas.kinds import AnyJobSpec, UnknownKindError
+from stickslip_schemas.kinds import AnyJobSpec, UnknownKindError, job_spec_adapter
 from stickslip_schemas.spec.jobs import JobSpec
 
 from stickslip_services.addresses import link, url
@@ -27,6 +27,7 @@ from stickslip_services.api.problems import ProblemError
 from stickslip_services.api.routes.common import ContextDep
 from stickslip_services.errors import NotFoundError, StickslipError
 from stickslip_services.pages.rendering import html_page
+from stickslip_services.pages.submit_filling import Filling, filled_form
 from stickslip_services.pages.submit_form import (
     AXIS_FORMS,
     MAX_FIELDS,
@@ -42,6 +43,7 @@ from stickslip_services.pages.submit_form import (
 )
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.estimate import validate_spec
+from stickslip_services.queue.jobs import find_job
 from stickslip_services.queue.submit import submit_job
 
 router = APIRouter(include_in_schema=False)
@@ -71,14 +73,19 @@ class Check:
 
 @router.get("/submit")
 def get_form(
+    context: ContextDep,
     kind: Annotated[str, Query(max_length=50)] = DEFAULT_KIND,
     scene: Annotated[str | None, Query(max_length=64)] = None,
+    job: Annotated[str, Query(max_length=64)] = "",
 ) -> Response:
-    """Show the form of a kind, or of a scene."""
+    """Show the form of a kind, or of a scene; or that of a job, filled in with its spec."""
+    form, filling = _form_of_job(context, job) if job else (_form(kind, scene), Filling())
     return html_page(
         "submit.html",
         here="submit",
-        form=_form(kind, scene),
+        form=form,
+        filling=filling,
+        job=job,
         kinds=kinds(),
         axis_forms=AXIS_FORMS,
         token=secrets.token_hex(8),
@@ -104,6 +111,13 @@ def _form(kind: str, scene: str | None) -> SubmitForm:
         return form_of(kind, scene or None)
     except (UnknownKindError, ValueError) as error:
         raise NotFoundError(f"there is no such form: {error}") from error
+
+
+def _form_of_job(context: Context, job: str) -> tuple[SubmitForm, Filling]:
+    """Return the form of a job and the values of its fields; raise NotFoundError."""
+    with context.database.read() as connection:
+        spec = job_spec_adapter.validate_json(find_job(connection, job).spec)
+    return filled_form(spec)
 
 
 async def _sent(request: Request) -> Sent:

@@ -1,125 +1,24 @@
-"""Sensitivity of the cloth solver to its constants.
+"""Small scenes in which cloth touches bodies, surfaces or itself, a few CPU seconds in all.
 
-Small scenes run with each constant halved and doubled.
-
-`python -m stickslip_testing.constants OUT.json` runs them all and writes what changes (4 CPU
-minutes).
+The golden tests record what they end with, and the sweeps in the comments of the solver's constants
+(`contact/constants.hpp`) are measured on them.
 """
 
-import json
-import sys
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
-from functools import cache
-from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
-from stickslip_sim_core import _sim_core
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.contact import Body, SelfContact, Surface, box, plane, sphere
 from stickslip_sim_core.cloth.fabrics import fabric
-from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
+from stickslip_sim_core.cloth.presets import SolverSettings
 from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
 
 from stickslip_testing.spheres import icosphere
 from stickslip_testing.tumbles import STEP, Tumble, crumple, folding, pile, squeeze
 
 FABRIC = "gray-interlock"
-COUNTS = frozenset(
-    {
-        *(
-            f"newton.{name}"
-            for name in (
-                "reversals_from",
-                "rounds_max",
-                "window",
-                "cuts_max",
-                "smooth_hops",
-                "hops",
-            )
-        ),
-        *("newton.halving_iterations", "newton.longest", "path.rounds_max", "factor.pool"),
-        *("stepping.stalled_soon", "stepping.stalled_long", "stepping.smooth_iterations"),
-        *("control.halvings", "control.looks"),
-    }
-)
-"""Constants that are integers >= 1."""
-
-LARGEST: Mapping[str, float] = MappingProxyType({"path.keep": 0.75})
-"""Bounds where twice the constant makes no sense: with `path.keep` = 1 nothing may approach."""
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What a scene ends with, and what it costs."""
-
-    positions: Floats
-    """(V, 3) [m]"""
-
-    newton: int
-    krylov: int
-    factors: float
-    unconverged: int
-    least_distance: float
-    """[m]"""
-
-
-@dataclass(frozen=True)
-class Change:
-    """Outcome with another constant, against the default."""
-
-    moved: float
-    """Largest distance of a vertex from where it was [m]."""
-
-    newton: float
-    krylov: float
-    factors: float
-    """Ratios."""
-
-    unconverged: int
-    least_distance: float
-    """[m]"""
-
-
-def scaled(name: str, factor: float) -> float:
-    """Return a constant times a factor, within `LARGEST`; counts are integers >= 1."""
-    value = min(_sim_core.cloth_constants()[name] * factor, LARGEST.get(name, np.inf))
-    return float(max(1, round(value))) if name in COUNTS else value
-
-
-def outcome(scene: str, constants: Mapping[str, float] = MappingProxyType({})) -> Outcome:
-    """Run a scene of `SCENES` with some constants replaced."""
-    cloth = SCENES[scene](replace(preset_named("certified"), constants=dict(constants)))
-    found = cloth.total
-    return Outcome(
-        cloth.positions,
-        found.newton,
-        found.krylov,
-        found.factorizations,
-        found.unconverged,
-        found.least_distance,
-    )
-
-
-@cache
-def default(scene: str) -> Outcome:
-    """Run a scene with the solver's constants, once."""
-    return outcome(scene)
-
-
-def change(scene: str, name: str, factor: float) -> Change:
-    """Run a scene with one constant times a factor, and compare."""
-    now, before = outcome(scene, {name: scaled(name, factor)}), default(scene)
-    return Change(
-        float(np.linalg.norm(now.positions - before.positions, axis=1).max()),
-        now.newton / before.newton,
-        now.krylov / before.krylov,
-        now.factors / before.factors,
-        now.unconverged,
-        now.least_distance,
-    )
 
 
 def _steps(tumble: Tumble, steps: int) -> Cloth:
@@ -213,22 +112,3 @@ SCENES: Mapping[str, Callable[[SolverSettings], Cloth]] = MappingProxyType(
 """Three sheets that fall onto each other, a strip that folds, a sheet that is crumpled by walls,
 one that is squeezed within its plane, one on a ball, one that slides, one on edges, one in a
 valley; the crumple and the fold by steps of the controller's choice."""
-
-
-def main(out: Path) -> None:
-    """Halve and double every constant in every scene, and write what changes."""
-    rows = [
-        {"constant": name, "factor": factor, "scene": scene}
-        | {key: float(f"{value:.3g}") for key, value in asdict(change(scene, name, factor)).items()}
-        for name in _sim_core.cloth_constants()
-        for factor in (0.5, 2.0)
-        if scaled(name, factor) != scaled(name, 1.0)
-        for scene in SCENES
-    ]
-    out.write_text(
-        json.dumps({"constants": _sim_core.cloth_constants(), "rows": rows}, indent=1) + "\n"
-    )
-
-
-if __name__ == "__main__":
-    main(Path(sys.argv[1]))

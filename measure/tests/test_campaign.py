@@ -1,0 +1,152 @@
+"""A campaign goes on after a fault, and where it was interrupted."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from stickslip_measure import experiments
+from stickslip_measure.campaign import Cell, Request, limit, measure, read_cell
+from stickslip_measure.cli import main
+from stickslip_measure.diagnosis import findings
+from stickslip_measure.experiments import capstan, drape, slopes, strips
+from stickslip_measure.process import Program
+
+Adapter = Callable[..., Program]
+
+LATE = "if self.time > 0.295:"
+"""The fall takes 0.3 s, and all other scenes more."""
+
+
+def measured(program: Program, out: Path, *names: str, seconds: float = 60.0) -> list[Cell]:
+    """Measure the default row, and return its cells."""
+    cells: list[Cell] = []
+    measure(Request(program, out, names, ("default",), seconds), cells.append)
+    return cells
+
+
+@pytest.mark.parametrize(
+    ("step", "state"),
+    [
+        (f"{LATE} raise ValueError('lost')", "failed"),
+        (f"{LATE} os.kill(os.getpid(), signal.SIGKILL)", "crashed"),
+        (f"{LATE} self.x = self.x * np.nan", "not finite"),
+    ],
+)
+def test_a_fault_is_a_cell_and_the_others_go_on(
+    falling: Adapter, tmp_path: Path, step: str, state: str
+) -> None:
+    cells = measured(falling(step), tmp_path, "incline-onset", "pinch")
+    assert [cell.state for cell in cells] == [
+        "measured",
+        state,
+        *[state] * 3,
+        *["not supported"] * 3,
+    ]
+    assert cells[-1].reason == "needs curved, planes"
+    assert cells[0].value == pytest.approx(1.0)
+
+
+def test_a_lie_about_time_is_named(falling: Adapter, tmp_path: Path) -> None:
+    liar = falling(step="self.x += 0; self.frame = 0.008")
+    cells = measured(liar, tmp_path)
+    faults = findings(cells)
+    assert faults[0].fault == "steps cover another time than they state"
+    assert "a second of its time is 0.800 s" in faults[0].evidence
+
+
+def test_drag_is_no_lie_about_time(falling: Adapter, tmp_path: Path) -> None:
+    cells = measured(falling(step="self.v *= 0.97"), tmp_path)
+    assert findings(cells)[0].fault == "something brakes a free fall"
+
+
+def test_a_campaign_goes_on_where_it_stopped(falling: Adapter, tmp_path: Path) -> None:
+    program = falling(step=f"{LATE} raise ValueError('lost')")
+    measured(program, tmp_path, "creep")
+    path = tmp_path / "falling" / "default" / "creep-10.json"
+    first = path.stat().st_mtime_ns
+    measured(program, tmp_path, "creep")
+    assert path.stat().st_mtime_ns == first
+    # A cell without a value is repeated on request, and every cell of a changed adapter is.
+    measure(Request(program, tmp_path, ("creep",), ("default",), 60.0, retry=True), lambda _: None)
+    second = path.stat().st_mtime_ns
+    assert second > first
+    measured(falling(step=f"{LATE} raise ValueError('gone')"), tmp_path, "creep")
+    assert read_cell(path).reason == "ValueError: gone"
+
+
+def test_a_damaged_cell_says_what_to_do(falling: Adapter, tmp_path: Path) -> None:
+    measured(falling(), tmp_path)
+    path = tmp_path / "falling" / "default" / "fall-4.json"
+    path.write_text("{}")
+    with pytest.raises(ValueError, match="is no cell: delete it and measure again"):
+        measured(falling(), tmp_path)
+
+
+def test_limit_and_order() -> None:
+    def cell(cells: int, value: float | None) -> Cell:
+        return Cell("s", "1", "default", "drape", cells, "measured", "", value, 1.0, 0.0, "")
+
+    value, order = limit([cell(n, 3.0 + 5.0 / n**2) for n in (40, 10, 20)])
+    assert value == pytest.approx(3.0)
+    assert order == pytest.approx(2.0)
+    assert np.isnan(limit([cell(10, 1.0), cell(20, None), cell(40, 1.0)])[0])
+
+
+def test_there_are_twelve_experiments_with_three_resolutions() -> None:
+    assert len(experiments.EXPERIMENTS) == 12
+    assert {len(one.cells) for one in experiments.EXPERIMENTS.values()} == {3}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--simulator", "bullet4"), "must be a Python file or one of stickslip"),
+        (("--experiment", "fold"), "invalid choice: 'fold'"),
+        (("--timeout", "-3"), "must be above 0 and below 1e6 s"),
+        (("--setting", "best"), "invalid choice: 'best'"),
+    ],
+)
+def test_wrong_arguments_are_refused(
+    arguments: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(arguments)
+    assert message in capsys.readouterr().err
+
+
+def test_an_adapter_that_cannot_be_imported(
+    falling: Adapter, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    program = falling(start="pass", name="undefined")
+    assert main(["--simulator", str(program.adapter), "--out", str(tmp_path / "out")]) == 1
+    assert "could not be set up: NameError" in capsys.readouterr().err
+
+
+# The closed forms of the experiments, against others.
+
+
+def test_the_ramp_finds_the_friction_of_its_own_closed_form() -> None:
+    shares = 0.3 * np.linspace(0.9, 1.15, 500)
+    moved = slopes.distances(shares, 0.02, 0.27)
+    assert slopes.friction_of_ramp(shares, 0.02, moved) == pytest.approx(0.27, rel=1e-9)
+
+
+def test_a_light_strip_over_a_cylinder_is_eulers() -> None:
+    """Nothing of it on the cylinder: a = g (heavy - light e) / (heavy + light e)."""
+    hanging = capstan.Hanging(1e-9, 0.1, 0.4)
+    euler = np.exp(0.3 * np.pi)
+    exact = 9.81 * (0.4 - 0.1 * euler) / (0.4 + 0.1 * euler)
+    assert capstan.acceleration(0.3, 0.0, 0.0, hanging) == pytest.approx(exact, rel=1e-6)
+
+
+def test_the_ring_plate_is_a_cantilever_if_it_is_narrow(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(drape, "DISC", 0.0999)
+    sag = drape.profile(np.array([drape.SHEET]))[0]
+    load = drape.LIGHT * 9.81 * drape.DENSITY / drape.BENDING
+    assert sag == pytest.approx(load * 1e-4**4 / 8.0, rel=2e-3)
+
+
+def test_the_drawn_cantilever_has_the_sag_of_the_master_curve() -> None:
+    x, z = strips.heavy_line()
+    assert strips.weight_of(-z[-1] / x[-1]) == pytest.approx(strips.GAMMA, rel=1e-4)

@@ -1,0 +1,181 @@
+"""An adapter runs in a process of its own. What goes wrong in it has a name and a reason."""
+
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from stickslip_measure import adapters
+from stickslip_measure.contract import Body, Floats, Sheet
+from stickslip_measure.process import (
+    AdapterError,
+    AdapterProcess,
+    ContractError,
+    CrashError,
+    HangError,
+    NotFiniteError,
+    Program,
+    SetupError,
+    Simulation,
+    SlowError,
+    StepError,
+    describe,
+)
+from stickslip_sim_core.cloth import meshes
+from stickslip_sim_core.cloth.contact import plane
+from stickslip_sim_core.cloth.fabrics import isotropic
+from stickslip_sim_core.cloth.presets import preset_named
+from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
+from stickslip_sim_core.protocols.inclined_plane import OnSlope
+
+Adapter = Callable[..., Program]
+
+OWN = Program(Path(adapters.__file__).with_name("stickslip.py"))
+DOWN = np.array([0.0, 0.0, -GRAVITY])
+MU = 0.3
+
+
+def patch(cells: int = 4) -> Sheet:
+    """Return a patch on a floor."""
+    mesh = meshes.grid(0.1, 0.1, cells, cells)
+    return Sheet(
+        mesh.rest,
+        np.column_stack([mesh.rest, np.zeros(len(mesh.rest))]),
+        mesh.triangles,
+        np.zeros(len(mesh.rest), dtype=np.int32),
+        mesh.spacing,
+        density=0.2,
+        stretching=100.0,
+        bending=1e-5,
+        bodies=(Body("plane", MU, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),),
+    )
+
+
+def fall(program: Program, log: Path, seconds: float = 30.0, duration: float = 0.3) -> Floats:
+    """Return the positions of a patch that has fallen."""
+    with AdapterProcess(program, log, seconds) as process:
+        simulation = Simulation(process, patch(), "default")
+        simulation.rest(duration, DOWN)
+        return simulation.positions
+
+
+def test_a_step_advances_and_returns_positions(falling: Adapter, tmp_path: Path) -> None:
+    end = fall(falling(), tmp_path / "log")
+    # Velocity first, then position: the distance of t is g t (t + dt)/2.
+    np.testing.assert_allclose(end[:, 2], -0.5 * GRAVITY * 0.3 * 0.31, rtol=1e-12)
+
+
+def test_what_a_simulator_prints_does_not_disturb(falling: Adapter, tmp_path: Path) -> None:
+    fall(falling(step="print('hello'); os.system('echo hi')"), tmp_path / "log")
+    assert "hello" in (tmp_path / "log").read_text()
+
+
+@pytest.mark.parametrize(
+    ("step", "start", "error", "reason"),
+    [
+        ("raise KeyError('v')", "pass", StepError, "KeyError: 'v'"),
+        ("pass", "raise RuntimeError('no GPU')", SetupError, "RuntimeError: no GPU"),
+        ("pass", "del Simulator.frame", SetupError, "frame"),
+        ("os.kill(os.getpid(), signal.SIGSEGV)", "pass", CrashError, "signal SIGSEGV"),
+        ("raise SystemExit(3)", "pass", CrashError, "exit code 3"),
+        ("self.x[0] = np.nan", "pass", NotFiniteError, "NaN"),
+        ("self.x[0] = 1e9", "pass", NotFiniteError, r"beyond 1e\+06 m"),
+        ("self.x = self.x[:3]; self.v = self.v[:3]", "pass", ContractError, "must have shape"),
+    ],
+)
+def test_failures_have_a_name_and_a_reason(
+    falling: Adapter,
+    tmp_path: Path,
+    step: str,
+    start: str,
+    error: type[AdapterError],
+    reason: str,
+) -> None:
+    with pytest.raises(error, match=reason):
+        fall(falling(step, start), tmp_path / "log")
+
+
+@pytest.mark.parametrize("frame", ["0.0", "float('nan')", "-1.0"])
+def test_a_frame_that_is_no_time_breaks_the_contract(
+    falling: Adapter, tmp_path: Path, frame: str
+) -> None:
+    with pytest.raises(ContractError, match="frame: must be finite and > 0"):
+        fall(falling(frame=frame), tmp_path / "log")
+
+
+def test_a_step_that_hangs_ends_in_time(falling: Adapter, tmp_path: Path) -> None:
+    with AdapterProcess(falling(step="time.sleep(600)"), tmp_path / "log", 60.0) as process:
+        simulation = Simulation(process, patch(), "default")
+        process.deadline = time.monotonic() + 0.5
+        with pytest.raises(HangError, match="no step ended within 60 s"):
+            simulation.rest(0.3, DOWN)
+
+
+def test_slow_is_not_hanging(falling: Adapter, tmp_path: Path) -> None:
+    slow = falling(step="time.sleep(600 if self.time > 0.155 else 0)")
+    with AdapterProcess(slow, tmp_path / "log", 60.0) as process:
+        simulation = Simulation(process, patch(), "default")
+        simulation.rest(0.1, DOWN)
+        process.deadline = time.monotonic() + 0.5
+        with pytest.raises(SlowError, match=r"60 s were over after 0\.1 s of the scene"):
+            simulation.rest(10.0, DOWN)
+
+
+def test_an_interpreter_that_does_not_exist(tmp_path: Path) -> None:
+    with pytest.raises(SetupError, match="/nowhere/python does not start: No such file"):
+        fall(Program(OWN.adapter, "/nowhere/python"), tmp_path / "log")
+
+
+def test_files_of_the_package_hide_no_module_of_the_simulator(
+    falling: Adapter, tmp_path: Path
+) -> None:
+    (tmp_path / "host.py").write_text("WHOSE = 'the simulator'\n")
+    program = falling(start="import host; assert host.WHOSE == 'the simulator'")
+    fall(program, tmp_path / "log")
+    assert describe(program, tmp_path / "log", 30.0).python == sys.version.split()[0]
+
+
+def test_the_core_by_its_adapter_gives_the_slope_of_the_protocol(tmp_path: Path) -> None:
+    """The slope and the drift of `OnSlope`, with the positions of a process: bit by bit."""
+    scene = patch()
+    certified = preset_named("certified")
+    direct = Cloth(
+        meshes.Mesh(scene.rest, scene.triangles),
+        isotropic(scene.density, scene.stretching, scene.bending),
+        certified,
+        force_scale=0.1 * scene.density * scene.cell**2 * GRAVITY,
+    )
+    protocol = OnSlope(direct, scene.start, MU, MU, np.ones(len(scene.start), dtype=bool))
+    with AdapterProcess(OWN, tmp_path / "log", 60.0) as process:
+        remote = OnSlope(
+            RemoteCloth(Simulation(process, scene, "default"), certified),  # type: ignore[arg-type]
+            scene.start,
+            MU,
+            MU,
+            np.ones(len(scene.start), dtype=bool),
+        )
+        assert remote.slip_slope() == protocol.slip_slope()
+        np.testing.assert_array_equal(remote.cloth.positions, direct.positions)
+
+
+class RemoteCloth:
+    """The verbs of `Cloth` that a protocol of slopes uses, by an adapter."""
+
+    def __init__(self, simulation: Simulation, preset: object) -> None:
+        self.simulation = simulation
+        self.preset = preset
+        self.gravity = np.tile(DOWN, (len(simulation.positions), 1))
+
+    @property
+    def positions(self) -> Floats:
+        return self.simulation.positions
+
+    def set_state(self, start: Floats) -> None:
+        np.testing.assert_array_equal(self.positions, start)
+
+    def step(self, dt: float, bodies: object) -> None:
+        assert repr(bodies) == repr([plane(MU)])
+        assert dt == self.simulation.frame
+        self.simulation.advance(self.gravity[:1])

@@ -1,0 +1,1 @@
+"""A textile laboratory: tests of fabrics by the standards of the field, on simulated cloth."""

@@ -1,0 +1,125 @@
+"""A run that has failed a check ends at once, and no other run ends early."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike
+
+from stickslip_sim_core import Body, box, fabric, plane, preset_named
+from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.cloth import checks, meshes
+from stickslip_sim_core.scenes.holders import Holder
+from stickslip_sim_core.scenes.scene import ClothRun, Scene
+
+pytestmark = pytest.mark.physics
+
+SECONDS = 2.0
+
+
+def lowered(depth: float) -> Scene:
+    """A square that hangs from an edge, which goes down by a depth [m] within a second.
+
+    The edge starts 0.1 m above a floor.
+    """
+    mesh = meshes.grid(0.1, 0.1, 6, 6)
+    start = np.column_stack([np.zeros(len(mesh.rest)), mesh.rest[:, 0], mesh.rest[:, 1] + 0.051])
+    held = np.flatnonzero(mesh.rest[:, 1] > 0.0499)
+
+    def pose(time: ArrayLike) -> Floats:
+        return np.column_stack([np.eye(3), [0.0, 0.0, -depth * min(float(np.asarray(time)), 1.0)]])
+
+    gravity = np.tile([0.0, 0.0, -9.81], (len(start), 1))
+    return Scene(
+        mesh=mesh,
+        fabrics=[fabric("gray-interlock")],
+        preset=preset_named("fast"),
+        start=start,
+        motion=lambda _time: (gravity, [plane(0.5)]),
+        holders=[Holder(held, pose)],
+        frames=int(SECONDS * 10) + 1,
+        frame_rate=10.0,
+    )
+
+
+@pytest.fixture(scope="module")
+def sunk() -> ClothRun:
+    """The holders go 5 cm into the floor."""
+    return lowered(0.15).run()
+
+
+def test_a_lost_run_ends_soon_after_it_fails(sunk: ClothRun) -> None:
+    # The holders reach the floor after 0.67 s.
+    assert sunk.code == "penetration"
+    assert sunk.times[-1] < 1.0
+
+
+def test_a_run_that_ends_late_has_the_same_verdict(
+    sunk: ClothRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(checks.Verdict, "_look", lambda _verdict: None)
+    whole = lowered(0.15).run()
+    assert whole.times[-1] == SECONDS
+    assert whole.code == sunk.code
+    both = len(sunk.positions)
+    assert np.array_equal(whole.positions[:both], sunk.positions)
+
+
+def test_a_valid_run_is_not_changed_by_the_looks(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = lowered(0.08).run()
+    monkeypatch.setattr(checks.Verdict, "_look", lambda _verdict: None)
+    unseen = lowered(0.08).run()
+    assert seen.valid
+    assert seen.times[-1] == SECONDS
+    assert np.array_equal(seen.positions, unseen.positions)
+    assert {name: seen.labels[name] for name in seen.labels} == unseen.labels
+
+
+def test_a_scene_without_a_valid_run_takes_no_step() -> None:
+    run = replace(lowered(0.08), reason="no stable start").run()
+    assert run.code == "solver_diverged"
+    assert len(run.positions) == 1
+    assert run.labels["steps"] == 0
+
+
+def squeezed() -> Scene:
+    """A napkin between a floor and a block that closes until both cross."""
+    mesh = meshes.grid(0.1, 0.1, 8, 8)
+    start = np.column_stack([mesh.rest, np.full(len(mesh.rest), 1e-3)])
+    gravity = np.tile([0.0, 0.0, -9.81], (len(start), 1))
+
+    def bodies(time: float) -> list[Body]:
+        upper = box(0.5, (0.2, 0.2, 0.1), rounding=0.04, origin=(0.0, 0.0, 0.06 - 0.2 * time))
+        return [plane(0.5), upper]
+
+    return Scene(
+        mesh=mesh,
+        fabrics=[fabric("gray-interlock")],
+        preset=preset_named("certified"),
+        start=start,
+        motion=lambda time: (gravity, bodies(time)),
+        frames=31,
+        frame_rate=100.0,
+    )
+
+
+def test_it_is_not_valid_for_what_was_squeezed() -> None:
+    run = squeezed().run()
+    assert run.code in {"penetration", "contact_gain", "passages", "unconverged"}
+    assert run.times[-1] < 0.1
+
+
+def test_a_step_that_may_not_fail_is_given_up() -> None:
+    assert _iterations(squeezed(), may_fail=False) < _iterations(squeezed(), may_fail=True)
+
+
+def _iterations(scene: Scene, *, may_fail: bool) -> int:
+    """Return the iterations up to the first step that does not converge, with all of its own."""
+    _, cloth = scene.begin()
+    cloth.advance(
+        0.1,
+        lambda time: (cloth.gravity, np.empty((0, 3)), scene.motion(time)[1]),
+        is_over=lambda: cloth.total.unconverged > 0,
+        may_fail=lambda: may_fail,
+    )
+    return cloth.total.newton
