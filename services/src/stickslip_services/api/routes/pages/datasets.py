@@ -17,6 +17,8 @@ from stickslip_schemas.documents.certificate import Certificate, Numbers, Protoc
 from stickslip_schemas.documents.responses import Dataset, DatasetVersion
 from stickslip_schemas.format.pictures import png
 from stickslip_schemas.spec.arrays import SPLITS
+from stickslip_schemas.spec.fabrics import measured_fabrics
+from stickslip_schemas.spec.reality import reality
 from stickslip_schemas.store import Store
 
 from stickslip_services.addresses import link
@@ -381,6 +383,8 @@ def get_certificate(digest: str, context: ContextDep) -> Response:
         digest=digest,
         builds=builds,
         plots=plots,
+        reality=reality(),
+        fabrics=measured_fabrics(),
     )
 
 
