@@ -107,8 +107,13 @@ def paths(app: FastAPI, worker: PretendWorker) -> list[str]:
         for job, clip in clips
         for page in (job, clip, f"{clip}/samples/1", f"{clip}/samples/0?beside=1")
     ]
+    # Samples of two datasets whose motions differ in number and rate.
+    places = [clip.removeprefix("/datasets/").replace("/v", ":v") for _, clip in clips]
+    compared = f"{clips[0][1]}/samples/0?beside=1&of={places[1]}"
     return [
         "/",
+        compared,
+        f"/submit?job={clips[0][0].rpartition('/')[2]}",
         *jobs,
         "/datasets",
         root,
@@ -318,7 +323,7 @@ def test_two_samples_share_the_cursor_and_the_layer(
     browser: Any, url: str, paths: list[str]
 ) -> None:
     page = browser.new_page()
-    page.goto(url + next(path for path in paths if "?beside=" in path))
+    page.goto(url + next(path for path in paths if path.endswith("?beside=1")))
     page.locator(".layer").select_option("depth")
     page.locator(".time").focus()
     page.keyboard.press("End")

@@ -194,6 +194,33 @@ def test_what_was_lost_is_shown(client: httpx.Client, worker: PretendWorker) -> 
     assert ("Sample 0 was rejected" in beside, beside.count("motion.json")) == (True, 1)
 
 
+def test_samples_of_two_datasets_are_compared(client: httpx.Client, worker: PretendWorker) -> None:
+    for name, gamma in (("first", (1.0, 2.0)), ("second", (3.0, 4.0))):
+        client.post("/v1/jobs", json=rods(name=name, gamma=gamma)).raise_for_status()
+        worker.work()
+    newest = client.get("/v1/datasets").json()["items"]
+    places = {entry["name"]: f"{entry['id']}:v1" for entry in newest}
+    page = f"/datasets/{places['first'].replace(':', '/')}/samples/1"
+    alone = html.unescape(read(client, page))
+    assert f'<option value="{places["second"]}">second, version 1' in alone
+    assert f'<option value="{places["first"]}"' not in alone
+
+    both = html.unescape(read(client, f"{page}?beside=0&of={places['second']}"))
+    assert "Sample 1 and sample 0 of second, version 1" in both
+    assert f'<option value="{places["second"]}" selected>' in both
+    for title in ("sample 1 of first, version 1", "sample 0 of second, version 1"):
+        assert f'"{title}: ' in both
+    assert both.count("data-plot=") == 1
+    rows = re.findall(r"<dt>gamma</dt><dd>([\d.]+)</dd><dd>([\d.]+)", both)
+    assert rows == [("1", "3")]  # slot 1 has the first gamma and the second phi1
+    second = places["second"].replace(":", "/")
+    assert f'data-motion="/ui/datasets/{second}/samples/0/motion.json"' in both
+
+    for wrong in ("ds-0000000000000000:v1", f"{places['second']}9", "second", ":v", "a:vb"):
+        assert client.get(f"{page}?beside=0&of={wrong}").status_code == 404
+    assert client.get(f"{page}?beside=9&of={places['second']}").status_code == 404
+
+
 def test_what_failed_is_shown_with_its_reproducer(
     client: httpx.Client, worker: PretendWorker, clock: ManualClock, app: FastAPI
 ) -> None:

@@ -95,6 +95,13 @@ def planned(document: dict[str, Any]) -> tuple[Any, ...]:
     return sorted(own), sorted(edges), [sample[:-1] for sample in plan.samples]
 
 
+def test_previews_are_spread_evenly_from_the_first_slot_on() -> None:
+    spec = parsed(rods(gamma=[float(gamma) for gamma in range(1, 11)], phi1=(1.0,)))
+    plan = expand(spec, PlanInputs(BUILDS, None), previews=3)
+    tasks_of_slots = {sample.slot: plan.tasks[sample.render_task] for sample in plan.samples}  # type: ignore[index]
+    assert [slot for slot, task in tasks_of_slots.items() if task.preview] == [0, 3, 6]
+
+
 RANGE = {"type": "linspace", "start": 1.0, "stop": 2.0, "num": 9}
 GRIDS = {
     "product": GRID,

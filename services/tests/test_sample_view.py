@@ -14,6 +14,7 @@ from stickslip_schemas.scene.library import built_in_files
 from stickslip_schemas.spec.arrays import array
 from stickslip_services.pages.browsing import thumbs
 from stickslip_services.pages.choosing import sliders
+from stickslip_services.pages.comparing import common_layers, label_rows, overlaid, timeline
 from stickslip_services.pages.motion import deformed, motion
 from stickslip_services.pages.pictures import coloured, mp4, shown_part
 from stickslip_services.pages.sample_page import sample_view
@@ -234,3 +235,38 @@ def test_only_the_part_of_a_frame_with_the_picture_is_shown() -> None:
     assert shown_part(depth, frames, np.array([2, 3])).shape == (2, 3, 2)
     assert shown_part(depth, frames, None) is frames
     assert shown_part(array("mu", "friction"), frames[0, 0, 0], np.array([2, 3])).shape == ()
+
+
+def test_samples_of_two_datasets_share_time_layers_curves_and_differences() -> None:
+    """Also of two kinds, with other motions, other ground truth and other labels."""
+    drag = {"material": "gray-interlock", "mu": 0.3, "texture": "dots", "viewpoint": "left"}
+    dragged = sample(kind="cloth_drag", mesh=5, axes=drag, ground_truth=["depth"])
+    on_cloth = sample(**ON_CLOTH)
+    views = [
+        {**sample_view(dragged, 0), "title": "sample 0 of drag"},
+        {**sample_view(on_cloth, 0), "title": "sample 0 of cloth"},
+    ]
+    assert [view["layers"] for view in views] == [["video", "depth"], ["video"]]
+    assert common_layers(views) == common_layers(views[::-1]) == ["video"]
+    last = [(view["instants"] - 1) / view["rate"] for view in views]
+    for order in (views, views[::-1]):
+        cursor = timeline(order)
+        assert cursor.rate == order[0]["rate"]
+        assert 0 <= (cursor.instants - 1) / cursor.rate - max(last) < 1 / cursor.rate
+
+    rows = {row.name: row for group in label_rows(views).values() for row in group}
+    assert rows["material"].values[1] == "–"
+    assert rows["fabric"].values[0] == "–"
+    assert "light" not in rows  # both have it, with one value
+
+    twice = [views[0], {**views[0], "title": "sample 1 of other"}]
+    assert label_rows(twice) == {}
+    for joined, single in zip(overlaid(twice), views[0]["plots"], strict=True):
+        names = [name for part in joined["tables"] for name in part["curves"]]
+        of_one = [name for part in single["tables"] for name in part["curves"]]
+        titles = ("sample 0 of drag", "sample 1 of other")
+        assert names == [f"{title}: {name}" for title in titles for name in of_one]
+        assert [part["dashed"] for part in joined["tables"]] == [False, True]
+    # What only one of them has is a plot of its own.
+    names = {of_sample["name"] for view in views for of_sample in view["plots"]}
+    assert {joined["name"] for joined in overlaid(views)} == names

@@ -181,8 +181,13 @@ def test_a_version_that_lacks_something_is_refused(make_dataset: Make) -> None:
         publish(changed(task, made.store, files=tuple(made.files[1:])), made.store)
     with pytest.raises(ValueError, match="files must be those of 2 shards"):
         publish(changed(task, made.store, labels=(made.packed[0].labels,)), made.store)
+    with pytest.raises(ValueError, match="one path twice"):
+        publish(changed(task, made.store, files=(*made.files, made.files[0])), made.store)
     with pytest.raises(ValueError, match="rejections must be the slots that are not valid"):
         publish(changed(task, made.store, rejections=()), made.store)
+    longer = made.files[0].model_copy(update={"size": made.files[0].size + 1})
+    with pytest.raises(OSError, match=rf"must have {longer.size} bytes"):
+        publish(changed(task, made.store, files=(longer, *made.files[1:])), made.store)
     with pytest.raises(
         ValueError, match=r"sections must have the samples 0 to 6, and they end at \[0, 6\]"
     ):

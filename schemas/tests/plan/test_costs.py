@@ -111,3 +111,15 @@ def test_an_unknown_scene_says_how_little_is_known() -> None:
     axes = {"texture": "dots", "viewpoint": "front"}
     costs = estimate(kind="cloth_scene", scene="turning-ball", axes=axes).stages[Stage.simulate]
     assert costs.high == pytest.approx(100 * costs.low)
+
+
+@pytest.mark.parametrize(
+    ("number", "splits"),
+    [
+        (7, {"train": 6, "validation": 0, "test": 1}),  # bounds 5.6 and 6.3
+        (15, {"train": 12, "validation": 2, "test": 1}),  # 12 and 13.5
+        (100, {"train": 80, "validation": 10, "test": 10}),
+    ],
+)
+def test_expected_splits_are_rounded_and_add_up(number: int, splits: dict[str, int]) -> None:
+    assert count(job_spec_adapter.validate_python(rods(number, "draft"))).expected_splits == splits

@@ -35,6 +35,7 @@ from stickslip_services.api.routes import catalog, health, jobs, workers
 from stickslip_services.api.routes.health import Metrics
 from stickslip_services.api.routes.pages import datasets as dataset_pages
 from stickslip_services.api.routes.pages import jobs as job_pages
+from stickslip_services.api.routes.pages import samples as sample_pages
 from stickslip_services.api.routes.pages import submit as submit_pages
 from stickslip_services.api.sse import Feeds
 from stickslip_services.catalog.inspector import MAX_PROCESSES
@@ -117,7 +118,8 @@ def make_app(settings: Settings, *, clock: Clock | None = None) -> FastAPI:
     app.state.worker_key = secret_in(settings.worker_key_path)
     # The routes of the workers come first: they are asked for most, and a request is compared with
     # one after the other.
-    modules = (workers, jobs, catalog, health, job_pages, dataset_pages, submit_pages)
+    pages = (job_pages, dataset_pages, sample_pages, submit_pages)
+    modules = (workers, jobs, catalog, health, *pages)
     app.state.routes = [route for module in modules for route in module.router.routes]
     app.router.routes += app.state.routes
     app.mount("/static", StaticFiles(directory=STATIC), name="static")

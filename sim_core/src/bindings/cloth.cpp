@@ -194,7 +194,7 @@ void bind_cloth(nb::module_& m) {
       .def(
           "advance",
           [](ClothSolver& self, double time, double event, const MotionCallback& motion,
-             const PathCallback& path) {
+             const PathCallback& path, bool may_fail) {
             DriveNow now;
             nb::gil_scoped_release release;
             const auto drive = [&](double at) -> BoundaryConditions {
@@ -203,15 +203,17 @@ void bind_cloth(nb::module_& m) {
               now = {gravity, held, surfaces, bodies_of(bodies)};
               return {now.gravity, now.held, now.surfaces, now.bodies, damping};
             };
-            const StepReport report =
-                self.advance(time, event, drive, [&](const std::vector<double>& times) -> Track {
+            const StepReport report = self.advance(
+                time, event, drive,
+                [&](const std::vector<double>& times) -> Track {
                   nb::gil_scoped_acquire acquire;
                   auto [points, poses] = path(times);
                   return {points, poses};
-                });
+                },
+                may_fail);
             return std::make_tuple(time, report);
           },
-          "time"_a, "event"_a, "motion"_a, "path"_a)
+          "time"_a, "event"_a, "motion"_a, "path"_a, "may_fail"_a)
       .def("momentum_rate", &ClothSolver::momentum_rate)
       .def("positions", &ClothSolver::positions)
       .def("velocities", &ClothSolver::velocities)

@@ -135,9 +135,10 @@ StepReport ClothSolver::step(double dt, const Points3& gravity, const Points3& h
   return impl_->stepper.step(dt, {gravity, held, surfaces, bodies, damping});
 }
 
-StepReport ClothSolver::advance(double& time, double event, const Motion& motion,
-                                const Path& path) {
+StepReport ClothSolver::advance(double& time, double event, const Motion& motion, const Path& path,
+                                bool may_fail) {
   if (!impl_->stepper.started()) begin(motion(time).bodies);
+  impl_->stepper.may_fail = may_fail;
   return impl_->controller.advance(time, event, motion, path);
 }
 

@@ -75,8 +75,9 @@ class ClothSolver {
   StepReport step(double dt, const Points3& gravity, const Points3& held, const Points3& surfaces,
                   const std::vector<Body>& bodies, double damping);
 
-  // A step of the controller's choice: see StepController::advance.
-  StepReport advance(double& time, double event, const Motion& motion, const Path& path);
+  // A step of the controller's choice: see StepController::advance, and Stepper for `may_fail`.
+  StepReport advance(double& time, double event, const Motion& motion, const Path& path,
+                     bool may_fail);
   // Rate of the cloth's momentum in the last step, N: the sum of all forces.
   Eigen::Vector3d momentum_rate() const;
 

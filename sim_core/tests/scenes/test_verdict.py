@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from stickslip_sim_core import fabric, plane, preset_named
+from stickslip_sim_core import Body, box, fabric, plane, preset_named
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import checks, meshes
 from stickslip_sim_core.scenes.holders import Holder
@@ -80,3 +80,46 @@ def test_a_scene_without_a_valid_run_takes_no_step() -> None:
     assert run.code == "solver_diverged"
     assert len(run.positions) == 1
     assert run.labels["steps"] == 0
+
+
+def squeezed() -> Scene:
+    """A napkin between a floor and a block that closes until both cross."""
+    mesh = meshes.grid(0.1, 0.1, 8, 8)
+    start = np.column_stack([mesh.rest, np.full(len(mesh.rest), 1e-3)])
+    gravity = np.tile([0.0, 0.0, -9.81], (len(start), 1))
+
+    def bodies(time: float) -> list[Body]:
+        upper = box(0.5, (0.2, 0.2, 0.1), rounding=0.04, origin=(0.0, 0.0, 0.06 - 0.2 * time))
+        return [plane(0.5), upper]
+
+    return Scene(
+        mesh=mesh,
+        fabrics=[fabric("gray-interlock")],
+        preset=preset_named("certified"),
+        start=start,
+        motion=lambda time: (gravity, bodies(time)),
+        frames=31,
+        frame_rate=100.0,
+    )
+
+
+def test_it_is_not_valid_for_what_was_squeezed() -> None:
+    run = squeezed().run()
+    assert run.code in {"penetration", "contact_gain", "passages", "unconverged"}
+    assert run.times[-1] < 0.1
+
+
+def test_a_step_that_may_not_fail_is_given_up() -> None:
+    assert _iterations(squeezed(), may_fail=False) < _iterations(squeezed(), may_fail=True)
+
+
+def _iterations(scene: Scene, *, may_fail: bool) -> int:
+    """Return the iterations up to the first step that does not converge, with all of its own."""
+    _, cloth = scene.begin()
+    cloth.advance(
+        0.1,
+        lambda time: (cloth.gravity, np.empty((0, 3)), scene.motion(time)[1]),
+        is_over=lambda: cloth.total.unconverged > 0,
+        may_fail=lambda: may_fail,
+    )
+    return cloth.total.newton

@@ -58,7 +58,7 @@ def _environment() -> Environment:
     )
     # Curves keep their order, and a script of the page could not read NaN.
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False}
-    filters = (duration, size, percent, number, moment, ago, words, plain)
+    filters = (duration, size, percent, number, moment, ago, words, plain, capitalized)
     environment.globals |= {"root": prefix, "service_url": url}
     environment.filters |= {function.__name__: function for function in filters}
     return environment
@@ -133,6 +133,11 @@ def ago(value: datetime) -> str:
 def words(value: object) -> str:
     """Return the name of a state or reason as words, without underscores."""
     return str(value).replace("_", " ")
+
+
+def capitalized(text: str) -> str:
+    """Return a text that begins with a capital letter; the names in it stay as they are."""
+    return text[:1].upper() + text[1:]
 
 
 def plain(text: str) -> str:

@@ -110,26 +110,6 @@ def _size(data: SampleData, name: str, slot: int) -> tuple[int, int]:
     return (width, height) if size is None else (int(size[0]), int(size[1]))
 
 
-def overlaid(views: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the plots of one sample, or those of two with the curves of both on one scale."""
-    if len(views) == 1:
-        plots: list[dict[str, Any]] = views[0]["plots"]
-        return plots
-    joined = []
-    for of_samples in zip(*(view["plots"] for view in views), strict=True):
-        tables = []
-        for position, (view, of_sample) in enumerate(zip(views, of_samples, strict=True)):
-            for part in of_sample["tables"]:
-                # A curve names its sample, and those of the second one are dashed.
-                curves = {
-                    f"sample {view['slot']}: {name}": values
-                    for name, values in part["curves"].items()
-                }
-                tables.append({**part, "curves": curves, "dashed": position > 0})
-        joined.append({**of_samples[0], "tables": tables})
-    return joined
-
-
 def _caption(data: SampleData, groups: Mapping[str, Mapping[str, tuple[object, str]]]) -> str:
     """Return the parameters of a sample that differ between samples, for example `mu 0.3`."""
     varied = {axis["name"] for axis in sliders(data.manifest.spec)}
@@ -177,12 +157,13 @@ def _plot(data: SampleData, name: str, slot: int) -> dict[str, Any]:
         x_name = "time [s]"
     curve_names = _curve_names(array, values.shape[1])
     curves = dict(zip(curve_names, values.T.tolist(), strict=True))
-    return plot(
+    shown = plot(
         table(x.tolist(), curves),
         x_name=x_name,
         y_name=f"{name}: {array.description}",
         is_timed=rate is not None,
     )
+    return {**shown, "name": name}
 
 
 def _curve_names(array: ArrayLayout, count: int) -> tuple[str, ...]:

@@ -285,9 +285,20 @@ class Verdict:
         self.is_lost = False
         """Whether some check has failed."""
 
+    def allows_failure(self) -> bool:
+        """Return whether a step that does not converge would leave the run valid."""
+        allowed = self._cloth.preset.unconverged_share_max
+        if allowed == 0.0:
+            return False
+        # One is allowed in a stretch of so many steps.
+        before = round(1.0 / allowed) - 1
+        lately = self._cloth.history.column("unconverged")
+        return not lately[max(0, len(lately) - before) :].any()
+
     def see_step(self) -> bool:
         """Return whether the run is lost after a step, by a look where the last one is long ago."""
-        if self._cloth.total.newton - self._looked_at >= LOOK_AFTER:
+        has_failed = self._cloth.history.column("unconverged")[-1:].any()
+        if has_failed or self._cloth.total.newton - self._looked_at >= LOOK_AFTER:
             self._look()
         return self.is_lost
 

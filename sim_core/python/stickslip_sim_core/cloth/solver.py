@@ -345,6 +345,7 @@ class Cloth:
         event: float = np.inf,
         damping: Callable[[float], float] = lambda _time: 0.0,
         is_over: Callable[[], bool] = lambda: False,
+        may_fail: Callable[[], bool] = lambda: True,
     ) -> None:
         """Take steps until one ends at `end` [s] or later.
 
@@ -363,6 +364,8 @@ class Cloth:
             event: Time of the next sudden change of the motion [s]. A step ends there.
             damping: Damping proportional to mass [1/s], added to the damping of each fabric.
             is_over: Function that returns whether to stop, which is asked after each step.
+            may_fail: Function that returns whether a step may stay unconverged, which is asked
+                before each step. Otherwise such a step is given up soon, and no step may follow.
 
         Raises:
             ValueError: `event` has passed, or `end` is not a number.
@@ -399,7 +402,7 @@ class Cloth:
         while self.time < end and self.spent <= 1.0:
             # `positions_at` interpolates between the two ends of this step.
             self._before = self.time, self.positions, self.velocities
-            self.time, report = self._solver.advance(self.time, event, drive, track)
+            self.time, report = self._solver.advance(self.time, event, drive, track, may_fail())
             self.total.add(report)
             self.history.add(self.time - self._before[0], report)
             # The sum of iterations drains at the allowed rate. A few hard steps therefore stay

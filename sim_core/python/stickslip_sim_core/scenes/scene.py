@@ -293,6 +293,7 @@ class Scene:
                 event=event,
                 damping=self.damping,
                 is_over=verdict.see_step,
+                may_fail=verdict.allows_failure,
             )
 
     def outcome(self, on_frame: OnFrame | None = None) -> Outcome:

@@ -49,7 +49,7 @@ function drawPlot(figure) {
   if (timed) view.addEventListener("instant", ({ detail }) => {
     now = detail / view.dataset.rate;
     plot.redraw(false);
-    plot.setLegend({ idx: detail });
+    plot.setLegend({ idx: plot.valToIdx(now) });
   });
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => plot.redraw(false));
   new ResizeObserver(() => plot.setSize(size())).observe(figure);
@@ -58,13 +58,16 @@ function drawPlot(figure) {
 // One cursor of time, an instant of the record, runs through the clip, its ground truth, the view in space and the curves.
 function showSample(view) {
   const slider = view.querySelector(".time"), play = view.querySelector(".play"), output = view.querySelector("output");
-  const layer = view.querySelector(".layer"), rate = +view.dataset.rate, instants = JSON.parse(view.dataset.frames);
-  const screens = [...view.querySelectorAll("[data-root]")].filter((clip) => clip.querySelector(".screen")).map((clip) => makeScreen(clip));
+  const layer = view.querySelector(".layer"), rate = +view.dataset.rate;
+  // Samples of two datasets may have other rates: the cursor counts instants of the first one.
+  const own = (part) => (+part.dataset.rate && rate ? now * +part.dataset.rate / rate : now) + 1e-6;
+  const screens = [...view.querySelectorAll("[data-root]")].filter((clip) => clip.querySelector(".screen"))
+    .map((clip) => ({ clip, frames: JSON.parse(clip.dataset.frames), ...makeScreen(clip) }));
+  const instants = screens[0]?.frames ?? [];
   let now = 0;
   const show = () => {
     if (output) output.textContent = rate ? `${(now / rate).toFixed(2)} of ${(slider.max / rate).toFixed(2)} s` : `frame ${Math.floor(now) + 1}`;
-    const frame = Math.max(0, instants.findLastIndex((instant) => instant <= now));
-    for (const screen of screens) screen.show(frame);
+    for (const { clip, frames, show } of screens) show(Math.max(0, frames.findLastIndex((instant) => instant <= own(clip))));
     view.dispatchEvent(new CustomEvent("instant", { detail: Math.floor(now) }));
   };
   const go = (instant) => { now = instant; slider.value = Math.floor(now); show(); };
@@ -98,7 +101,7 @@ function showSample(view) {
       button.disabled = true;
       message.textContent = "The motion is being loaded.";
       try {
-        await (await import(view.dataset.space)).show(figure, Math.floor(now));
+        await (await import(view.dataset.space)).show(figure, () => Math.floor(own(figure)));
         message.textContent = "";
       } catch (error) {
         message.textContent = error.message;

@@ -3,7 +3,8 @@ import * as three from "./three.min.js";
 
 const STATES = ["--open", "--stick", "--slip"]; // colours of the states of contact, by code
 
-export async function show(figure, start) {
+// `instant` gives the instant of this sample that the cursor of the page is at.
+export async function show(figure, instant) {
   const canvas = figure.querySelector("canvas"), view = figure.closest(".sample");
   let renderer;
   try {
@@ -93,14 +94,13 @@ export async function show(figure, start) {
   }
 
   const controls = new three.OrbitControls(camera, canvas), draw = () => renderer.render(scene, camera);
-  let now = start;
   const go = () => {
-    const step = Math.max(0, motion.instants.findLastIndex((instant) => instant <= now));
+    const step = Math.max(0, motion.instants.findLastIndex((stored) => stored <= instant()));
     for (const move of moves) move(step);
     draw();
   };
   const repaint = () => { for (const paint of paints) paint(); go(); };
-  view.addEventListener("instant", (event) => { now = event.detail; go(); });
+  view.addEventListener("instant", go);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", repaint);
   controls.target.copy(middle);
   // Two samples beside each other have one scale: that of the larger one.

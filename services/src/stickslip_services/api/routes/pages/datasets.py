@@ -1,49 +1,34 @@
 """Pages of datasets (the list, one version, its samples), of scenes, and of certificates."""
 
-import json
 from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import lru_cache
-from importlib.util import find_spec
 from typing import Annotated, Any, Literal
 from urllib.parse import urlencode
 
 import numpy as np
-from fastapi import APIRouter, Depends, Path, Query, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse, StreamingResponse
 from pydantic import BaseModel, Field
 from sqlalchemy import Connection
 from stickslip_schemas.documents.certificate import Certificate, Numbers, ProtocolReport
-from stickslip_schemas.documents.responses import Dataset, DatasetVersion
 from stickslip_schemas.format.pictures import png
 from stickslip_schemas.spec.arrays import SPLITS
 from stickslip_schemas.spec.fabrics import measured_fabrics
 from stickslip_schemas.spec.reality import reality
-from stickslip_schemas.store import Store
 
 from stickslip_services.addresses import link
-from stickslip_services.api.artifacts import matches
-from stickslip_services.api.routes.common import ContextDep, Version
+from stickslip_services.api.routes.common import ContextDep
+from stickslip_services.api.routes.pages.opened import PICTURE_SECONDS, OpenedDep, value_of
 from stickslip_services.catalog.inputs import find_certificate, list_certificates
 from stickslip_services.catalog.scenes import known_scenes
-from stickslip_services.catalog.versions import (
-    find_dataset,
-    find_version,
-    list_datasets,
-    read_contents,
-)
+from stickslip_services.catalog.versions import find_dataset, list_datasets
 from stickslip_services.database.database import PageRequest
 from stickslip_services.errors import NotFoundError
 from stickslip_services.pages.browsing import histograms, losses, picture_array, shards, thumbs
 from stickslip_services.pages.choosing import CONDITIONS, OPERATORS, choose, sliders, sortable
-from stickslip_services.pages.motion import motion
-from stickslip_services.pages.pictures import Range, coloured, mp4, range_of, shown_part
+from stickslip_services.pages.pictures import coloured
 from stickslip_services.pages.rendering import html_page, plot, scene_text, spec_text, table
-from stickslip_services.pages.sample_page import overlaid, sample_view
-from stickslip_services.pages.samples import Array, SampleData
 from stickslip_services.pages.zipping import MAX_ZIPPED, zipped
 from stickslip_services.queue.context import Context
-from stickslip_services.queue.jobs import jobs_of_version
 from stickslip_services.queue.workers import alive_workers
 
 router = APIRouter(include_in_schema=False)
@@ -52,9 +37,6 @@ SHOWN_DATASETS = 50
 SHOWN_CERTIFICATES = 200
 SHOWN_CURVES = 6
 """Curves of a protocol that its page shows."""
-
-PICTURE_SECONDS = 24 * 3600
-"""Time for which a browser keeps a picture [s]."""
 
 COVER_SIDE = 56
 """Least shorter side of the picture of a dataset in the list [px]."""
@@ -72,37 +54,6 @@ class DatasetFilter(BaseModel):
 
 
 DatasetFilterDep = Annotated[DatasetFilter, Query()]
-Slot = Annotated[int, Path(ge=0)]
-Step = Annotated[int, Query(ge=1, le=32)]
-Beside = Annotated[int | None, Query(ge=0)]
-
-
-@dataclass(frozen=True, slots=True)
-class Opened:
-    """A version that a page shows, its arrays, and the jobs that made it (id, name)."""
-
-    dataset: Dataset
-    version: DatasetVersion
-    data: SampleData
-    jobs: list[tuple[str, str]]
-
-
-def _opened(dataset: str, version: Version, context: ContextDep) -> Opened:
-    with context.database.read() as connection:
-        visible_dataset = find_dataset(connection, dataset)
-        visible_version = find_version(connection, dataset, version)
-        makers = jobs_of_version(connection, dataset, version)
-    # The manifest never changes, so what it lists is read once for all pages of the version.
-    data = _sample_data(context.store, visible_version.manifest)
-    return Opened(visible_dataset, visible_version, data, makers)
-
-
-@lru_cache(maxsize=8)
-def _sample_data(store: Store, manifest: str) -> SampleData:
-    return SampleData(store, read_contents(store, manifest))
-
-
-OpenedDep = Annotated[Opened, Depends(_opened)]
 
 
 @router.get("/datasets")
@@ -135,7 +86,7 @@ def get_cover(opened: OpenedDep) -> Response:
     valid = np.flatnonzero(data.label("valid"))
     if name is None or not valid.size:
         return Response(_NO_PICTURE, media_type="image/png", headers=headers)
-    values = _value(data, name, int(valid[0]))
+    values = value_of(data, name, int(valid[0]))
     (picture,) = coloured(data.arrays[name], values, [len(values) // 2])
     step = max(1, min(picture.shape[:2]) // COVER_SIDE)
     return Response(png(picture[::step, ::step]), media_type="image/png", headers=headers)
@@ -218,121 +169,10 @@ def get_selection(request: Request, opened: OpenedDep) -> Response:
     return StreamingResponse(zipped(opened.data, slots), 200, headers, "application/zip")
 
 
-@router.get("/datasets/{dataset}/v{version}/samples/{slot}")
-def get_sample(
-    opened: OpenedDep, slot: int, beside: Annotated[str, Query(max_length=20)] = ""
-) -> Response:
-    """Show the pictures, curves, shapes and labels of a sample, or of two samples side by side."""
-    data = opened.data
-    last = data.manifest.sample_count - 1
-    slots = [slot]
-    if beside.isdecimal():
-        slots.append(int(beside))
-    if not all(0 <= number <= last for number in slots):
-        name = f"version {opened.version.version} of {opened.dataset.id}"
-        raise NotFoundError(f"{name} has slots 0 to {last}, not {', '.join(map(str, slots))}")
-    # A rejected sample has labels of its rejection, and no arrays.
-    rejections = {number: data.rejection(number) for number in slots}
-    valid = [number for number in slots if rejections[number] is None]
-    views = [sample_view(data, number) for number in valid]
-    return html_page(
-        "sample.html",
-        here="datasets",
-        dataset=opened.dataset,
-        version=opened.version,
-        jobs=opened.jobs,
-        slot=slot,
-        last_slot=last,
-        rejections=[rejection for rejection in rejections.values() if rejection is not None],
-        views=views,
-        plots=overlaid(views),
-        has_mp4=find_spec("av") is not None,
-    )
-
-
-@router.get("/ui/datasets/{dataset}/v{version}/samples/{slot}/{array}.mp4")
-def get_film(opened: OpenedDep, slot: Slot, array: str, beside: Beside = None) -> Response:
-    """Return a clip, or its ground truth, as MP4 with 10 frames a second.
-
-    Numbers have one scale with those of the sample `beside` it.
-    """
-    # The browser plays the film; without PyAV the page shows its frames.
-    data = opened.data
-    values = _value(data, array, slot)
-    if data.arrays[array].dimensions[:3] != ("frame", "y", "x"):
-        raise NotFoundError(f"{array[:50]} is no clip")
-    scale = _scale(data, array, values, beside)
-    film = mp4(coloured(data.arrays[array], values, range(len(values)), scale))
-    headers = {"Cache-Control": f"private, max-age={PICTURE_SECONDS}"}
-    return Response(film, media_type="video/mp4", headers=headers)
-
-
-def _scale(data: SampleData, array: str, values: Array, beside: int | None) -> Range | None:
-    """Return the range of an array over two samples; None if there is one sample, or no number."""
-    is_number = values.dtype.kind == "f"
-    if beside is None or not is_number:
-        return None
-    ranges = [range_of(values), range_of(_value(data, array, beside))]
-    return min(low for low, _ in ranges), max(high for _, high in ranges)
-
-
 @router.get("/ui/datasets/{dataset}/v{version}/spec.yaml")
 def get_spec(opened: OpenedDep) -> Response:
     """Return the spec of a version as YAML."""
     return Response(spec_text(opened.data.manifest.spec), media_type="application/yaml")
-
-
-@router.get("/ui/datasets/{dataset}/v{version}/samples/{slot}/{array}/{index}.png")
-def get_picture(
-    opened: OpenedDep,
-    slot: Slot,
-    array: str,
-    index: Annotated[int, Path(ge=0)],
-    request: Request,
-    step: Step = 1,
-    beside: Beside = None,
-) -> Response:
-    """Return a picture or a frame of ground truth of a sample as PNG.
-
-    `step` takes every `step`-th pixel.
-    """
-    data = opened.data
-    # Without the name of the array, which is in the address.
-    tag = f'"{opened.version.manifest[:32]}-{slot}-{index}-{step}-{beside}"'
-    headers = {"Cache-Control": f"private, max-age={PICTURE_SECONDS}", "ETag": tag}
-    if matches(request.headers.get("if-none-match"), tag):
-        return Response(status_code=304, headers=headers)
-    values = _value(data, array, slot)
-    if data.arrays[array].dimensions[1:3] != ("y", "x") or index >= len(values):
-        raise NotFoundError(f"{array[:50]} has no picture {index}")
-    scale = _scale(data, array, values, beside)
-    (picture,) = coloured(data.arrays[array], values, [index], scale)
-    content = png(picture[::step, ::step])
-    return Response(content, media_type="image/png", headers=headers)
-
-
-@router.get("/ui/datasets/{dataset}/v{version}/samples/{slot}/motion.json")
-def get_motion(opened: OpenedDep, slot: Slot) -> Response:
-    """Return what the view of a sample in three dimensions draws, as JSON."""
-    try:
-        if slot >= opened.data.manifest.sample_count:
-            raise KeyError(slot)
-        document = motion(opened.data, slot)
-    except KeyError as error:
-        name = f"version {opened.version.version} of {opened.dataset.id}"
-        raise NotFoundError(f"{name} has no shape of a sample {slot}") from error
-    return Response(json.dumps(document, allow_nan=False), media_type="application/json")
-
-
-def _value(data: SampleData, array: str, slot: int) -> Array:
-    """Return the value of an array for a sample; raise NotFoundError."""
-    if array not in data.arrays or slot >= data.manifest.sample_count:
-        raise NotFoundError(f"the dataset has no {array[:50]!r} of sample {slot}")
-    try:
-        size = data.picture_size(slot)
-        return shown_part(data.arrays[array], data.read(array, slot), size)
-    except KeyError as error:
-        raise NotFoundError(f"sample {slot} has no {array[:50]!r}") from error
 
 
 @router.get("/scenes")
