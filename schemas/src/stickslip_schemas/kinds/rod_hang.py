@@ -82,6 +82,7 @@ class RodHangRender(Render):
 class RodHangSpec(JobSpec):
     """Rods that hang from a clamp under their own weight, seen by four cameras."""
 
+    subject = "rods"
     simulation_type = RodHangSimulation
     render_type = RodHangRender
     # Each rod has a colour of its own, so the axes of all enter the seed.

@@ -177,6 +177,7 @@ class ClipRender(Render):
 class ClipSpec(JobSpec):
     """Base of the specs of cloth: clips of trajectories, and names that users define."""
 
+    subject = "cloth"
     variant_axis = "texture"
     instants: ClassVar[int]
     """How many instants of the motion a trajectory holds."""
