@@ -18,11 +18,11 @@ RASTER_SOURCES = $(wildcard workers/blender/raster/* workers/blender/cmake/*) \
 # reconstruction.py calls render_rod_set.py with Blender's interpreter, reader.py needs a dataset, yarn.py centrelines, cloth_contact.py
 # takes half an hour. render_cloth.py needs a trajectory, which render_trajectory.py simulates for a minute, and then renders for an hour.
 BENCHMARKS = $(filter-out $(addprefix benchmarks/, render_rod_set.py cloth_contact.py render_cloth.py render_trajectory.py \
-  reader.py yarn.py),$(wildcard benchmarks/*.py))
+  reader.py yarn.py reality.py),$(wildcard benchmarks/*.py))
 DISTRIBUTIONS = schemas sim_core measure services training workers workers/blender
 CPP_FILES = $(shell find sim_core/src sim_core/tests/core workers/blender/raster -name "*.[ch]pp")
 
-.PHONY: setup setup-dev demo test-fast test test-kernels test-slow test-main test-blender test-without-blender test-core check size density docs bench wheels release-wheels release-check constraints clean
+.PHONY: setup setup-dev demo test-fast test test-kernels test-slow test-main test-blender test-without-blender test-core check size density docs bench reality wheels release-wheels release-check constraints clean
 
 # The environments that `make demo` and the service need. Tests and checks need more: setup-dev.
 setup: .venv/core.stamp .venv-blender/raster.stamp
@@ -139,6 +139,10 @@ bench: setup-dev
 	  echo "== $$script"; \
 	  case $$script in */render_*) $(BLENDER_PY) $$script ;; *) $(PY) $$script ;; esac || exit 1; \
 	done
+
+# Drape and bending of the built-in fabrics, beside published measurements: docs/reality.md. Remove the record to measure all.
+reality: setup-dev
+	$(PY) benchmarks/reality.py
 
 # Everything that PyPI gets: source distributions, and wheels of this machine. Release wheels come from cibuildwheel.
 wheels: setup-dev

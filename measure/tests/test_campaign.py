@@ -10,6 +10,7 @@ from stickslip_measure.campaign import Cell, Request, limit, measure, read_cell
 from stickslip_measure.cli import main
 from stickslip_measure.diagnosis import findings
 from stickslip_measure.experiments import capstan, drape, slopes, strips
+from stickslip_measure.page import write_page
 from stickslip_measure.process import Program
 
 Adapter = Callable[..., Program]
@@ -73,6 +74,34 @@ def test_a_campaign_goes_on_where_it_stopped(falling: Adapter, tmp_path: Path) -
     assert second > first
     measured(falling(step=f"{LATE} raise ValueError('gone')"), tmp_path, "creep")
     assert read_cell(path).reason == "ValueError: gone"
+
+
+def test_the_page_says_who_holds_and_why_a_cell_has_no_value(
+    falling: Adapter, tmp_path: Path
+) -> None:
+    measured(falling(step=f"{LATE} raise ValueError('<lost>')"), tmp_path, "creep", "pinch")
+    page = write_page(tmp_path).read_text()
+    assert "<h1>Who holds, and who creeps</h1>" in page
+    # The verdict, the cell of creep, and the reason of both; text of an adapter is no markup.
+    assert '<td class="poor" title="ValueError: &lt;lost&gt;">no answer</td>' in page
+    assert "failed: ValueError: &lt;lost&gt;" in page
+    assert "<lost>" not in page
+    assert "not supported: needs curved, planes" in page
+    # The fall has a curve, and says what the adapter did.
+    assert 'aria-label="A patch falls: height [mm] against time [s]"' in page
+    assert "step: 10 ms" in page
+
+
+def test_the_command_writes_a_page_or_says_that_nothing_was_measured(
+    falling: Adapter, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert main(["--out", str(out)]) == 1
+    assert "has no cells; name a simulator with --simulator" in capsys.readouterr().err
+    adapter = str(falling().adapter)
+    assert main(["--simulator", adapter, "--experiment", "pinch", "--out", str(out)]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == str(out / "index.html")
+    assert (out / "index.html").exists()
 
 
 def test_a_damaged_cell_says_what_to_do(falling: Adapter, tmp_path: Path) -> None:

@@ -7,10 +7,14 @@ from typing import Any
 import pytest
 import yaml
 from click.testing import CliRunner, Result
+from stickslip_schemas.documents.certificate import Certificate
 from stickslip_schemas.kinds import job_spec_adapter
+from stickslip_schemas.spec.fabrics import measured_fabrics
+from stickslip_schemas.spec.reality import reality
 from stickslip_services.cli import app
 from stickslip_services.cli.documents import read_job, read_scene
 from stickslip_services.errors import CommandError
+from stickslip_services.pages.rendering import html_page
 
 LINEN = {
     "density": 0.2,
@@ -100,6 +104,26 @@ def test_the_built_in_fabrics_are_listed_with_their_bending_lengths() -> None:
     listed = json.loads(run("fabrics", "--json").stdout)
     assert listed["gray-interlock"]["bending_length"] == [13.0, 16.1]
     assert "11oz-black-denim" in run("fabrics").stdout
+
+
+def test_a_certificate_is_shown_beside_measurements() -> None:
+    page = html_page(
+        "certificate.html",
+        here="certificates",
+        certificate=Certificate.model_construct(
+            preset="fast", sim_core="0" * 64, passed=True, extent="full", protocols=()
+        ),
+        digest="1" * 64,
+        builds=set(),
+        plots={},
+        reality=reality(),
+        fabrics=measured_fabrics(),
+    ).body
+    text = bytes(page).decode()
+    assert "Against measurements" in text
+    assert "<td>13, 16.1</td>" in text
+    assert "denim 70 to 90 %" in text
+    assert "hysteresis of bending" in text
 
 
 def test_the_laboratory_tests_a_card_of_a_file(tmp_path: Path) -> None:

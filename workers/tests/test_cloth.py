@@ -341,7 +341,10 @@ def test_three_readers_give_back_what_went_in(
         frame_share=round(float(made.arrays["frame_share"][made.arrays["valid"]].mean()), 4),
         device="cpu",
     )
-    assert "PSNR of its clips [dB]" in (directory / "README.md").read_text()
+    card = (directory / "README.md").read_text()
+    assert "PSNR of its clips [dB]" in card
+    assert "| `gray-interlock` | 13, 16.1 |" in card
+    assert "A label `mu` is the mu of this model" in card
     with Image.open(directory / "preview.webp") as picture:
         assert (picture.format, picture.n_frames) == ("WEBP", 2)
     assert manifest.cameras == load_rig("drag")

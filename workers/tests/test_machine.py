@@ -65,6 +65,25 @@ def test_a_machine_that_cannot_be_measured_is_the_reference_machine(
     assert not (tmp_path / "speed.json").exists()
 
 
+def test_a_drag_alone_and_drags_together_are_timed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Under a quota of one CPU, the drag has it alone, and two share it."""
+    runs: list[int] = []
+
+    def time_drags(processes: int) -> list[machine.DragTimes]:
+        runs.append(processes)
+        wall = 0.25 * processes
+        return [machine.DragTimes(cpu_seconds=0.25, wall_seconds=wall)] * processes
+
+    monkeypatch.setattr(machine, "_time_drags", time_drags)
+    speed = machine.measure_speed(2)
+    assert (speed.cpu_alone, speed.cpu_available) == (1.0, 0.5)
+    assert speed.cpu_speed == pytest.approx(machine.REFERENCE_CPU_SECONDS / 0.25)
+    assert runs == [1, 2]
+    # With one slot, both are the same.
+    assert machine.measure_speed(1).cpu_available == 1.0
+    assert runs == [1, 2, 1]
+
+
 def test_the_name_of_a_machine_has_its_quota(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -3,6 +3,7 @@
 import argparse
 import sys
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 
 from stickslip_measure import __version__, experiments
@@ -118,6 +119,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
             sys.stderr.write(f"{options.simulator}: {error.state}: {error}\n")
             return 1
         print_findings(options.out, description.name)
+    return print_page(options.out)
+
+
+def print_page(out: Path) -> int:
+    """Write the page, and print where it is; return 1 if no cell is there."""
+    if not read_cells(out):
+        sys.stderr.write(f"{out}: has no cells; name a simulator with --simulator\n")
+        return 1
+    # Numbers need no matplotlib.
+    if find_spec("matplotlib") is None:
+        print_line("The page needs matplotlib: pip install ./sim_core './measure[page]'")
+        return 0
+    from stickslip_measure.page import write_page
+
+    print_line(str(write_page(out)))
     return 0
 
 

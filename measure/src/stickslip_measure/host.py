@@ -21,6 +21,9 @@ FOLDER = Path(__file__).resolve().parent
 
 LOGGER = logging.getLogger("stickslip_measure")
 
+REASON_LENGTH = 160
+"""Most characters of an exception that a cell shows."""
+
 CLEARANCE = 0.0
 GAP = 5e-4
 
@@ -35,6 +38,13 @@ def load(path: Path, name: str) -> Any:
     sys.modules[name] = module
     spec.loader.exec_module(module)
     return module
+
+
+def reason_of(error: Exception) -> str:
+    """Return an exception as one short line; the log has all of it."""
+    lines = str(error).strip().splitlines() or [""]
+    text = f"{type(error).__name__}: {lines[0]}".strip().rstrip(":")
+    return text if len(text) <= REASON_LENGTH else f"{text[:REASON_LENGTH]}..."
 
 
 class Host:
@@ -55,8 +65,7 @@ class Host:
         except Exception as error:
             # Whatever an adapter raises is a result of the measurement: the reason of a cell.
             LOGGER.exception("the adapter raised")
-            text = f"{type(error).__name__}: {error}".strip().rstrip(":")
-            reply = {"error": text}
+            reply = {"error": reason_of(error)}
             results = []
         reply["cpu"] = time.process_time()
         return bytes(self.wire.encoded(reply, results))

@@ -25,6 +25,9 @@ FRAMES_AT_ONCE = 16
 LOG_LINES = 3
 """Last lines of what a crashed process printed that its reason quotes."""
 
+LOG_LENGTH = 240
+"""Most characters of them."""
+
 LARGEST = 1e6
 """Positions beyond this are no result of a scene of some centimetres [m]."""
 
@@ -201,7 +204,7 @@ class AdapterProcess:
         if code < 0:
             ending = f"signal {signal.Signals(-code).name}"
         lines = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-        printed = " | ".join(lines[-LOG_LINES:])
+        printed = " | ".join(lines[-LOG_LINES:])[-LOG_LENGTH:]
         return CrashError(f"{ending}, printed: {printed}" if printed else ending)
 
 

@@ -84,11 +84,25 @@ def test_packaged_costs_follow_the_speed_of_the_machine() -> None:
     half = estimate(slots=2, speed=MachineSpeed(cpu_available=0.5), **rods(1000, "draft"))
     assert slow.cpu_seconds.median == pytest.approx(2 * here.cpu_seconds.median)
     assert half.cpu_seconds == here.cpu_seconds
-    assert here.wall_seconds is not None
-    assert half.wall_seconds is not None
-    assert half.wall_seconds.median - JOB_SECONDS == pytest.approx(
-        2 * (here.wall_seconds.median - JOB_SECONDS)
-    )
+
+
+def test_few_tasks_have_what_a_quota_leaves_to_all_slots() -> None:
+    """A quota of one CPU: one task has all of it, and each of two tasks has half."""
+    quota = MachineSpeed(cpu_available=0.5, cpu_alone=1.0)
+
+    def work_of(texture_and_size: dict[str, Any], speed: MachineSpeed) -> float:
+        costs = estimate(slots=2, speed=speed, **texture_and_size)
+        assert costs.wall_seconds is not None
+        return costs.wall_seconds.median - JOB_SECONDS
+
+    # One simulation and one shading are alone, with and without the quota.
+    assert work_of(clips("dots"), quota) == pytest.approx(work_of(clips("dots"), MachineSpeed()))
+    # A job of many tasks takes as long as its CPU time, which two slots would halve.
+    many = rods(1000, "high")
+    assert work_of(many, quota) == pytest.approx(2 * work_of(many, MachineSpeed()), rel=0.01)
+    # A third of a CPU is all that one task can have, too.
+    third = MachineSpeed(cpu_available=1 / 6, cpu_alone=1 / 3)
+    assert work_of(clips("dots"), third) == pytest.approx(3 * work_of(clips("dots"), quota))
 
 
 def test_a_measured_stage_does_not_follow_the_speed() -> None:

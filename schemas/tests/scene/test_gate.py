@@ -160,6 +160,11 @@ def test_a_hostile_file_is_refused_at_once(name: str) -> None:
     assert peak < MEMORY
 
 
+def test_a_comment_behind_a_face_has_no_corners() -> None:
+    vertices = b"v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+    check_file(vertices + b"f 1 2 3 # of the left sleeve\n" * (MAX_TRIANGLES // 4))
+
+
 def test_files_at_the_limits_pass() -> None:
     vertices = b"v 0.123456789 0.123456789 0.123456789\n" * MAX_VERTICES
     check_file(vertices + b"f 1 2 3\n" * MAX_TRIANGLES)

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 from stickslip_schemas.base import replace_at
+from stickslip_schemas.scene import sizes, start
+from stickslip_schemas.scene.box_trees import Workload
 from stickslip_schemas.scene.document import Scene
 from stickslip_schemas.scene.errors import UnfitStartError
 from stickslip_schemas.scene.files import inlined, with_arrays
@@ -18,6 +20,7 @@ from stickslip_schemas.scene.geometry import (
     find_touch,
 )
 from stickslip_schemas.scene.library import built_in_files, load_scene, scene_names
+from stickslip_schemas.scene.motions import Track
 from stickslip_schemas.scene.shapes import box_rounding
 from stickslip_schemas.scene.start import check_start, find_start_faults
 from stickslip_schemas.spec.jobs import StartFault
@@ -441,6 +444,55 @@ FAULTS += [
     ),
 ]
 
+JAWS: dict[tuple[str, ...], Any] = {
+    HOLDERS: {"hand": {"edge": "top"}},
+    (*CLOTH, "turn"): [np.pi / 2, 0, 0],
+    ORIGIN: [0.0, 0.0, 0.1],
+}
+"""A curtain in the plane of x and z, held at its upper edge."""
+
+
+def jaw(side: float, *moves: tuple[float, float]) -> dict[str, Any]:
+    """Return a jaw at 20 mm from the curtain, which moves along y by distances at times [m, s]."""
+    return {
+        "type": "box",
+        "size": [0.06, 0.04, 0.06],
+        "origin": [0.0, 0.04 * side, 0.1],
+        "motion": keys(*((time, [0.0, way, 0.0]) for time, way in moves)),
+    }
+
+
+FAULTS += [
+    (
+        # Each jaw is 20 mm from the cloth, so they are 6 mm too far together.
+        {
+            **JAWS,
+            ("bodies", "ball"): jaw(-1, (0.1, 0.0), (0.5, 0.023)),
+            THING: jaw(1, (0.1, 0.0), (0.5, -0.023)),
+        },
+        ("bodies", "ball", "motion"),
+        "between this body and thing, and at 0.5 s it is 6 mm further than the cloth lets it",
+        {"time": 0.5},
+    ),
+    (
+        # They close too far, and then open far.
+        {
+            **JAWS,
+            ("bodies", "ball"): jaw(-1, (0.1, 0.0), (0.3, 0.023), (0.6, -0.1)),
+            THING: jaw(1, (0.1, 0.0), (0.3, -0.023), (0.6, 0.1)),
+        },
+        ("bodies", "ball", "motion"),
+        "and at 0.3 s it is 6 mm further",
+        {"time": 0.3},
+    ),
+    (
+        {ORIGIN: [0.0, 0.0, 60.0]},
+        ORIGIN,
+        "the nearest thing is 60 m away, 600 times the size of the sheet; did you mean mm?",
+        [0.0, 0.0, 60.0],
+    ),
+]
+
 
 def without_placeholders(value: Any) -> Any:
     """Return a body without the fields of the shape that it replaces."""
@@ -500,6 +552,22 @@ CAN_START: list[dict[tuple[str, ...], Any]] = [
     {(*CLOTH, "mesh"): file_mesh("stretched.obj"), (*CLOTH, "start"): {"type": "file"}},
     {THING: {"type": "mesh", "file": "late.npz"}},
     {**LYING, THING: {"type": "mesh", "file": "soft-press.npz"}},
+    # Jaws that leave a millimetre each, or go along with each other.
+    {
+        **JAWS,
+        ("bodies", "ball"): jaw(-1, (0.1, 0.0), (0.5, 0.019)),
+        THING: jaw(1, (0.1, 0.0), (0.5, -0.019)),
+    },
+    {
+        **JAWS,
+        ("bodies", "ball"): jaw(-1, (0.1, 0.0), (0.5, 0.01)),
+        THING: jaw(1, (0.1, 0.0), (0.5, 0.01)),
+    },
+    # A sheet far up that a hand carries.
+    {
+        ORIGIN: [0.0, 0.0, 60.0],
+        HOLDERS: {"h": {"edge": "left", "motion": keys((0.1, [0, 0, 0]), (0.5, [0, 0, 0.1]))}},
+    },
     # Cloth that stands at a wall falls before a press is there.
     {
         (*CLOTH, "turn"): [0, np.pi / 2, 0],
@@ -613,11 +681,14 @@ def test_every_pair_of_random_triangles_is_compared() -> None:
             find_crossing(
                 TriangleMesh(one.vertices, one.triangles[i : i + 1]),
                 TriangleMesh(other.vertices, other.triangles[j : j + 1]),
+                Workload(10_000),
             )
             for i in range(20)
             for j in range(20)
         ]
-        assert (find_crossing(one, other) is None) == all(item is None for item in single)
+        assert (find_crossing(one, other, Workload(10_000)) is None) == all(
+            item is None for item in single
+        )
 
 
 def test_touches_are_found_at_faces_edges_and_corners() -> None:
@@ -630,16 +701,90 @@ def test_touches_are_found_at_faces_edges_and_corners() -> None:
         ((0.2, 0.1, 3e-4), False),
         ((1.0 + 2e-4, 1.0 + 2e-4, 0.0), False),
     ):
-        touch = find_touch(np.array([point]), mesh, 2e-4)
+        touch = find_touch(
+            TriangleMesh(np.array([point]), np.empty((0, 3), np.int64)),
+            mesh,
+            2e-4,
+            Workload(10_000),
+        )
         assert (touch is not None) == expected, point
 
 
 def test_a_fold_crosses_itself_and_a_hinge_does_not() -> None:
     hinge = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0.5]], float)
-    assert find_self_crossing(TriangleMesh(hinge, np.array([[0, 1, 2], [1, 3, 2]]))) is None
+    assert (
+        find_self_crossing(TriangleMesh(hinge, np.array([[0, 1, 2], [1, 3, 2]])), Workload(10_000))
+        is None
+    )
     through = np.array(
         [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.2, 0.2, -1], [0.3, 0.2, 1], [0.2, 0.3, 1]], float
     )
-    crossing = find_self_crossing(TriangleMesh(through, np.arange(6).reshape(2, 3)))
+    crossing = find_self_crossing(
+        TriangleMesh(through, np.arange(6).reshape(2, 3)), Workload(10_000)
+    )
     assert crossing is not None
     assert (crossing.first, crossing.second) == (0, 1)
+
+
+def test_too_many_pairs_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Slanted needles, whose boxes all overlap, would take a check a minute."""
+    changes: dict[tuple[str, ...], Any] = {
+        THING: {"type": "mesh", "file": "cube.obj"},
+        ORIGIN: [0.0, 0.0, 0.01],
+    }
+    (fault,) = faults_of(changes)
+    assert fault.location == ORIGIN
+    monkeypatch.setattr(start, "MAX_COMPARED_PAIRS", 20)
+    (fault,) = faults_of(changes)
+    assert fault.location == ("sheets",)
+    assert "at most 20 pairs of boxes around their triangles" in fault.rule
+
+
+def test_files_are_limited_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One file may serve many bodies: each of them costs time."""
+    bodies: dict[tuple[str, ...], Any] = {}
+    for name, x in (("ball", 0.2), ("thing", 0.4)):
+        motion = keys((0.0, [x, 0, 0.1]), (0.5, [x, 0, 0.11]))
+        bodies["bodies", name] = {"type": "mesh", "file": "cube.obj", "motion": motion}
+    assert faults_of(bodies) == []
+    monkeypatch.setattr(sizes, "MAX_BODY_TRIANGLES", 23)
+    (fault,) = faults_of(bodies)
+    assert (fault.location, fault.value) == (("bodies",), 24)
+    assert "at most 23 triangles together" in fault.rule
+
+
+def test_a_path_with_a_key_every_millisecond_is_compared() -> None:
+    """Where windows of keys overlap, even samples stand for them: a jump is seen all the same."""
+    times = np.linspace(0.0, 10.0, 10_001)
+    x = 0.02 * np.sin(times)
+    x[7_000:] += 0.05
+    motion = {
+        "spin": None,
+        "about": None,
+        "keys": None,
+        "path": {"time": times, "move": np.outer(x, [1, 0, 0]), "turn": np.zeros((10_001, 3))},
+        "interpolation": "linear",
+        "ramp": 0.0,
+    }
+    time, unevenness = Track(motion).unevenness(0.0078, 0.1, 10.0)
+    assert time == pytest.approx(7.0, abs=0.01)
+    # The middle of the step is half the jump away from an even motion.
+    assert unevenness == pytest.approx(0.025, rel=0.15)
+
+
+def test_a_linear_motion_with_ramps_is_exact() -> None:
+    motion = {
+        "spin": None,
+        "about": None,
+        "path": None,
+        "keys": [
+            {"time": 1.0, "move": [0, 0, 0], "turn": [0, 0, 0]},
+            {"time": 2.0, "move": [0.5, 0, 0], "turn": [0, 0, 0]},
+        ],
+        "interpolation": "linear",
+        "ramp": 0.2,
+    }
+    x = Track(motion).at(np.array([0.0, 1.1, 1.2, 1.5, 2.0, 2.1, 2.2, 9.0]))[:, 0]
+    # Speed 0.5 m/s after a ramp of 0.2 s: v t^2 / (2 r) within it, v (t - r / 2) after it.
+    expected = [0.0, 0.0125, 0.05, 0.2, 0.45, 0.4875, 0.5, 0.5]
+    assert x == pytest.approx(expected, abs=1e-12)

@@ -118,7 +118,14 @@ WRONG: list[tuple[Any, ...]] = [
         '"Felt"',
     ),
     (f"{UPPER}.material", "fellt", "", "did you mean felt"),
-    (f"{UPPER}.origin", [0, 0, FAR], f"{UPPER}.origin.2", "less than or equal to 100 [m]"),
+    (
+        f"{UPPER}.origin",
+        [0, 0, FAR],
+        f"{UPPER}.origin.2",
+        "less than or equal to 100 [m]; did you mean mm?",
+    ),
+    (f"{UPPER}.turn", [0, 0, 90.0], f"{UPPER}.turn.2", "mean degrees? 90 degrees are 1.5708 rad"),
+    (f"{UPPER}.thickness", 0.5, "", "did you mean mm? 0.5 mm are 0.0005 m"),
     (f"{UPPER}.turn", [0, 0, 2000.0], f"{UPPER}.turn.2", "less than or equal to 6.2832 [rad]"),
     (f"{UPPER}.thickness", 0.0, "", "greater than or equal to 0.00001 [m]"),
     (

@@ -1,12 +1,14 @@
 """The speed of this machine: a short drag of cloth, timed on some of its CPUs at the same time.
 
 The packaged costs of specs are CPU seconds of a reference machine, on which `REFERENCE_CPU_SECONDS`
-was measured. Two numbers convert them to another machine:
+was measured. Three numbers convert them to another machine:
 
     cpu_speed     = REFERENCE_CPU_SECONDS / CPU seconds of the drag here
     cpu_available = CPU seconds of the drag here / its wall time
+    cpu_alone     = the same, of a drag that runs alone
 
-The second number is below 1 if a quota or other programs leave less than a CPU to each process.
+The last two are below 1 if a quota or other programs leave less than a CPU to a process. Under a
+quota of one CPU, a process that runs alone has all of it, and each of two has half.
 
     python -m stickslip_workers.machine     runs the drag and prints its times as JSON
 """
@@ -37,7 +39,7 @@ DRAG_VERTICES = 11
 DRAG_SECONDS = 10.0
 """Mesh and duration [s] of the drag.
 
-It is long enough to time, and two drags take a second of CPU.
+It is long enough to time, and three drags take 1.5 s of CPU.
 """
 
 MAX_PROCESSES = 2
@@ -158,11 +160,26 @@ def machine_speed(file: Path, slots: int) -> MachineSpeed:
 
 
 def measure_speed(processes: int) -> MachineSpeed:
-    """Run the drag in some processes at the same time, and return the speed of the machine."""
+    """Run the drag alone, and in some processes at once; return the speed of the machine."""
+    (alone,) = _time_drags(1)
+    together = _time_drags(processes) if processes > 1 else [alone]
+    cpu_seconds = sum(time.cpu_seconds for time in together) / len(together)
+    wall_seconds = sum(time.wall_seconds for time in together) / len(together)
+    cpu_available = min(1.0, cpu_seconds / wall_seconds)
+    return MachineSpeed(
+        cpu_speed=REFERENCE_CPU_SECONDS / cpu_seconds,
+        cpu_available=cpu_available,
+        # Of several processes, none has more than one that is alone.
+        cpu_alone=max(cpu_available, min(1.0, alone.cpu_seconds / alone.wall_seconds)),
+    )
+
+
+def _time_drags(processes: int) -> list[DragTimes]:
+    """Run the drag in some processes at the same time, and return the times of each."""
     command = [sys.executable, "-m", "stickslip_workers.machine"]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     running = []
-    for _ in range(max(processes, 1)):
+    for _ in range(processes):
         running.append(subprocess.Popen(command, stdout=subprocess.PIPE, env=environment))
     times = []
     for process in running:
@@ -170,12 +187,7 @@ def measure_speed(processes: int) -> MachineSpeed:
         if process.returncode != 0:
             raise subprocess.CalledProcessError(process.returncode, command)
         times.append(DragTimes.model_validate_json(output))
-    cpu_seconds = sum(time.cpu_seconds for time in times) / len(times)
-    wall_seconds = sum(time.wall_seconds for time in times) / len(times)
-    return MachineSpeed(
-        cpu_speed=REFERENCE_CPU_SECONDS / cpu_seconds,
-        cpu_available=min(1.0, cpu_seconds / wall_seconds),
-    )
+    return times
 
 
 def drag() -> DragTimes:

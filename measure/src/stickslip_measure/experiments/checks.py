@@ -90,8 +90,13 @@ def balance(laboratory: Laboratory, cells: int) -> Reading:
     tilt = np.tan(np.arctan2(turn, along))
     # The tilt that brings the mean of the vertices below the hook.
     equal = rest[:, 0].mean() / (rest[:, 1].mean() - top)
+    edge = rest[:, 1] < 1e-9 - 0.5 * HIGH
     return Reading(
-        float(tilt / equal), 0.0, 1e3 * still[:, 0], 1e3 * still[:, 2], 1e3 * start[:, 2]
+        float(tilt / equal),
+        0.0,
+        1e3 * still[edge, 0],
+        1e3 * still[edge, 2],
+        1e3 * start[edge, 2],
     )
 
 
@@ -115,7 +120,7 @@ CHECKS = (
         "of the tilt",
         frozenset({"held"}),
         (4,),
-        ("x [mm]", "z [mm]"),
+        ("x [mm]", "height of the lower edge [mm]"),
         balance,
     ),
 )

@@ -18,10 +18,10 @@ from stickslip_schemas.spec.arrays import SPLITS
 from stickslip_schemas.spec.axes import axis_values
 from stickslip_schemas.spec.jobs import JobSpec, SeedRule
 
-PUBLISH_SECONDS = 0.3
+PUBLISH_SECONDS = 0.2
 """CPU time of publishing a version [s]."""
 
-PUBLISH_SHARD_SECONDS = 0.02
+PUBLISH_SHARD_SECONDS = 0.002
 """CPU time of a shard in a version that is published [s]."""
 
 JOB_SECONDS = 2.0
@@ -137,7 +137,10 @@ class MachineSpeed(Document):
         default=1.0, gt=0, description="CPU time there over CPU time here, of the same work"
     )
     cpu_available: Float = Field(
-        default=1.0, gt=0, le=1, description="CPUs that a busy process gets: less under a quota"
+        default=1.0, gt=0, le=1, description="CPUs that a process gets while all slots are busy"
+    )
+    cpu_alone: Float = Field(
+        default=1.0, gt=0, le=1, description="CPUs that a process gets while no other one is busy"
     )
 
 
@@ -172,9 +175,10 @@ def estimate_cost(
 
     `measured` are the CPU times of stages that a service knows [s]; packaged costs stand for the
     others, and `speed` carries them over to the machine of the workers. With c_s the CPU time of
-    stage s, n_s its tasks, p slots and a the CPUs that each slot gets,
+    stage s, n_s its tasks, p slots, a the CPUs that each busy slot gets and b those of a slot that
+    is busy alone,
 
-        T = sum_s c_s / (a min(n_s, p)) + JOB_SECONDS
+        T = sum_s c_s / min(b n_s, a p) + JOB_SECONDS
     """
     speed = speed or MachineSpeed()
     stages = _packaged_costs(spec, counts, speed, max(slots, 1)) | dict(measured)
@@ -231,7 +235,9 @@ def _wall_time(
     for name in Interval.model_fields:
         seconds = JOB_SECONDS
         for stage, interval in stages.items():
-            parallel = max(1, min(slots, tasks[stage]))
-            seconds += getattr(interval, name) / (parallel * speed.cpu_available)
+            # Few tasks share what all slots have together.
+            available = speed.cpu_available * slots
+            cpus = min(max(1, tasks[stage]) * max(speed.cpu_alone, speed.cpu_available), available)
+            seconds += getattr(interval, name) / cpus
         walls[name] = seconds
     return Interval(**walls)

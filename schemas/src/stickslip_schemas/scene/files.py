@@ -23,7 +23,7 @@ from stickslip_schemas.scene.gate import MAX_TRIANGLES, check_file, is_path_tabl
 from stickslip_schemas.scene.mesh_files import FARTHEST, Polygons, has_order, read_polygons
 from stickslip_schemas.scene.parameters import Location, value_at, with_values
 from stickslip_schemas.scene.parts import LARGEST, SMALLEST, MeshBody, unit_hint
-from stickslip_schemas.scene.polygons import Floats, Indices, triangulate, weld
+from stickslip_schemas.scene.polygons import Floats, Indices, repeated_numbers, triangulate, weld
 from stickslip_schemas.scene.reading import read_once
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl")
@@ -335,22 +335,21 @@ def _check_edges(triangles: Indices, vertices: int) -> None:
         )
     # One number for each row: sorting rows takes ten times as long.
     a, b, c = np.sort(triangles, axis=1).T
-    _, first, counts = np.unique(
-        (a * vertices + b) * vertices + c, return_index=True, return_counts=True
-    )
-    if (counts > 1).any():
+    numbers = (a * vertices + b) * vertices + c
+    repeated = repeated_numbers(numbers)
+    if len(repeated):
         raise UnfitFileError(
-            f"each triangle must be there once, and {int((counts - 1).sum())} repeat another one, "
-            f"such as triangle {int(first[int(np.argmax(counts > 1))])}: delete them (in Blender: "
-            "merge vertices by distance)"
+            f"each triangle must be there once, and {len(repeated)} repeat another one, such as "
+            f"triangle {int(np.argmax(numbers == repeated[0]))}: delete them (in Blender: merge "
+            "vertices by distance)"
         )
     edges = triangles * vertices + np.roll(triangles, -1, axis=1)
-    _, counts = np.unique(edges, return_counts=True)
-    if (counts > 1).any():
+    repeated = np.unique(repeated_numbers(edges.ravel()))
+    if len(repeated):
         raise UnfitFileError(
             "must be a manifold: at most two triangles share an edge, turned alike; "
-            f"{int((counts > 1).sum())} edges are not so: turn all faces to one side (in Blender: "
-            "Mesh, Normals, Recalculate Outside), and delete faces inside"
+            f"{len(repeated)} edges are not so: turn all faces to one side (in Blender: Mesh, "
+            "Normals, Recalculate Outside), and delete faces inside"
         )
 
 

@@ -1,10 +1,8 @@
 """Geometry of triangles: which cross, which points lie on them, and which a ray meets first.
 
-Candidates come from two trees of boxes, so that the cost grows with the number of triangles, not
-with its square.
+Candidates come from trees of boxes (`box_trees`).
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
@@ -12,18 +10,18 @@ from itertools import islice
 import numpy as np
 import numpy.typing as npt
 
+from stickslip_schemas.scene.box_trees import BoxTree, Workload, overlapping_boxes
+
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
-
-CANDIDATES_AT_ONCE = 100_000
-"""Candidates that are compared in one operation: bounds the memory to about 100 MB."""
 
 EDGE_SLACK = 1e-12
 """Share of a triangle beyond its edge at which a ray still meets it: rounding leaves no gap there.
 """
 
-MORTON_BITS = 10
-"""Bits of each coordinate of a Morton code: boxes that are neighbours in it are near each other."""
+PLANE_SLACK = 1e-12
+"""Distance from a plane that rounding can give to a point on it [m]; coordinates are up to 100 m.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,9 +40,30 @@ class TriangleMesh:
         return self.vertices[self.triangles]
 
     @cached_property
-    def tree(self) -> "BoxTree":
+    def planes(self) -> tuple[Floats, Floats]:
+        """Normals n (T, 3) of length 1 and offsets d (T,) [m] of n x = d; 0 without an area."""
+        a, b, c = self.corners.transpose(1, 0, 2)
+        normals = _cross_product(b - a, c - a)
+        normals /= np.maximum(np.sqrt(_dot(normals, normals)), 1e-300)[:, None]
+        return normals, _dot(normals, a)
+
+    @cached_property
+    def tree(self) -> BoxTree:
         """The boxes of the triangles."""
-        return BoxTree(self.corners.min(axis=1), self.corners.max(axis=1))
+        a, b, c = self.corners.transpose(1, 0, 2)
+        low = np.minimum(np.minimum(a, b), c)
+        return BoxTree(low, np.maximum(np.maximum(a, b), c))
+
+    @cached_property
+    def tree_of_vertices(self) -> BoxTree:
+        """The boxes of the vertices, which have no size."""
+        return BoxTree(self.vertices, self.vertices)
+
+    @cached_property
+    def thin_axis(self) -> Floats:
+        """The direction (3,) along which it extends least, of length 1."""
+        centered = self.vertices - self.vertices.mean(axis=0)
+        return np.asarray(np.linalg.eigh(centered.T @ centered)[1][:, 0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,118 +86,89 @@ class Touch:
     """[m]"""
 
 
-# ---- Candidates
+def are_apart(first: TriangleMesh, second: TriangleMesh, reach: float) -> bool:
+    """Return True if a plane along either mesh parts both by more than `reach` [m].
 
-
-class BoxTree:
-    """A binary tree of boxes, level by level, whose leaves are given boxes."""
-
-    def __init__(self, low: Floats, high: Floats) -> None:
-        """Build the tree over N boxes with corners `low` and `high`, (N, 3) [m] each."""
-        count = len(low)
-        self.depth = max(count - 1, 0).bit_length()
-        self.order = np.argsort(_morton_codes(0.5 * (low + high)), kind="stable")
-        # Leaves without a box are empty: they overlap nothing.
-        leaves = 2**self.depth
-        lowest = np.full((leaves, 3), np.inf)
-        highest = np.full((leaves, 3), -np.inf)
-        lowest[:count] = low[self.order]
-        highest[:count] = high[self.order]
-        self.levels = [(lowest, highest)]
-        for _ in range(self.depth):
-            lowest = lowest.reshape(-1, 2, 3).min(axis=1)
-            highest = highest.reshape(-1, 2, 3).max(axis=1)
-            self.levels.append((lowest, highest))
-        self.levels.reverse()
-
-
-def _morton_codes(points: Floats) -> Integers:
-    """Return codes (N,) in whose order points (N, 3) [m] follow a space-filling curve."""
-    low = points.min(axis=0)
-    extent = max(float((points.max(axis=0) - low).max()), 1e-300)
-    cells = ((points - low) / extent * (2**MORTON_BITS - 1)).astype(np.int64)
-    codes = np.zeros(len(points), np.int64)
-    for bit in range(MORTON_BITS):
-        for axis in range(3):
-            codes |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
-    return codes
-
-
-def overlapping_boxes(first: BoxTree, second: BoxTree) -> Iterator[tuple[Integers, Integers]]:
-    """Yield the pairs of boxes that overlap, as numbers of boxes, in batches."""
-    start = (np.zeros(1, np.int64), np.zeros(1, np.int64), 0, 0)
-    waiting = [start]
-    while waiting:
-        i, j, level_first, level_second = waiting.pop()
-        low_first, high_first = first.levels[level_first]
-        low_second, high_second = second.levels[level_second]
-        overlaps = (low_first[i] <= high_second[j]) & (low_second[j] <= high_first[i])
-        overlap_everywhere = overlaps.all(axis=1)
-        i = i[overlap_everywhere]
-        j = j[overlap_everywhere]
-        if not len(i):
-            continue
-        if level_first == first.depth and level_second == second.depth:
-            yield first.order[i], second.order[j]
-            continue
-        # Both trees are descended by one level, as long as they have another.
-        if level_first < first.depth:
-            i, j = np.repeat(2 * i, 2) + np.tile([0, 1], len(i)), np.repeat(j, 2)
-            level_first += 1
-        if level_second < second.depth:
-            j, i = np.repeat(2 * j, 2) + np.tile([0, 1], len(j)), np.repeat(i, 2)
-            level_second += 1
-        for begin in range(0, len(i), CANDIDATES_AT_ONCE):
-            end = begin + CANDIDATES_AT_ONCE
-            waiting.append((i[begin:end], j[begin:end], level_first, level_second))
+    Many sheets over each other are done with so. False says nothing.
+    """
+    for axis in (first.thin_axis, second.thin_axis):
+        places_first, places_second = first.vertices @ axis, second.vertices @ axis
+        gaps = (places_first.min() - places_second.max(), places_second.min() - places_first.max())
+        if max(gaps) > reach:
+            return True
+    return False
 
 
 # ---- Crossings
 
 
 def find_crossing(
-    first: TriangleMesh, second: TriangleMesh, *, batches: int | None = None
+    first: TriangleMesh, second: TriangleMesh, workload: Workload, *, batches: int | None = None
 ) -> Crossing | None:
     """Return two triangles of two meshes that cross; None if none do.
 
     `batches` ends the search after so many batches of candidates, where another fault is known.
+    Raises TooManyPairsError.
     """
-    corners_first = first.corners
-    corners_second = second.corners
-    for i, j in islice(overlapping_boxes(first.tree, second.tree), batches):
-        crosses = _cross(corners_first[i], corners_second[j])
-        if crosses.any():
-            return _crossing(i, j, crosses, corners_first)
+    for i, j in islice(overlapping_boxes(first.tree, second.tree, workload), batches):
+        crossing = _first_crossing(first, second, i, j)
+        if crossing is not None:
+            return crossing
     return None
 
 
-def find_self_crossing(mesh: TriangleMesh) -> Crossing | None:
-    """Return two triangles of one mesh that cross and share no vertex; None if none do."""
-    corners = mesh.corners
-    for i, j in overlapping_boxes(mesh.tree, mesh.tree):
+def find_self_crossing(mesh: TriangleMesh, workload: Workload) -> Crossing | None:
+    """Return two triangles of one mesh that cross and share no vertex; None if none do.
+
+    Raises TooManyPairsError.
+    """
+    vertices = mesh.triangles.T
+    for i, j in overlapping_boxes(mesh.tree, mesh.tree, workload):
         # Neighbours meet at the vertices that they share, which is no crossing.
-        pairs = mesh.triangles[i][:, :, None] == mesh.triangles[j][:, None, :]
-        apart = (i < j) & ~pairs.any(axis=(1, 2))
-        i, j = i[apart], j[apart]
-        crosses = _cross(corners[i], corners[j])
-        if crosses.any():
-            return _crossing(i, j, crosses, corners)
+        shares = np.zeros(len(i), dtype=bool)
+        for first in vertices:
+            for second in vertices:
+                shares |= first[i] == second[j]
+        i, j = i[~shares], j[~shares]
+        crossing = _first_crossing(mesh, mesh, np.minimum(i, j), np.maximum(i, j))
+        if crossing is not None:
+            return crossing
     return None
 
 
-def _crossing(
-    i: Integers, j: Integers, crosses: npt.NDArray[np.bool_], corners: Floats
-) -> Crossing:
+def _first_crossing(
+    first: TriangleMesh, second: TriangleMesh, i: Integers, j: Integers
+) -> Crossing | None:
+    """Return the first of pairs of triangles, i of one mesh and j of another, that cross."""
+    # Most neighbours lie on one side of the other's plane, and are done with here.
+    reaches = _reaches_plane(first, i, second, j)
+    i, j = i[reaches], j[reaches]
+    reaches = _reaches_plane(second, j, first, i)
+    i, j = i[reaches], j[reaches]
+    crosses = _cross(first.corners[i], second.corners[j])
+    if not crosses.any():
+        return None
     number = int(np.argmax(crosses))
-    x, y, z = corners[i[number]].mean(axis=0).tolist()
+    x, y, z = first.corners[i[number]].mean(axis=0).tolist()
     return Crossing(int(i[number]), int(j[number]), (x, y, z))
+
+
+def _reaches_plane(
+    first: TriangleMesh, i: Integers, second: TriangleMesh, j: Integers
+) -> npt.NDArray[np.bool_]:
+    """Return whether triangles i of a mesh may have corners on both sides of planes j: (N,)."""
+    normals, offsets = second.planes
+    heights = np.einsum("nij,nj->ni", first.corners[i], normals[j]) - offsets[j][:, None]
+    a, b, c = heights.T
+    lowest = np.minimum(np.minimum(a, b), c)
+    highest = np.maximum(np.maximum(a, b), c)
+    return np.asarray((lowest <= PLANE_SLACK) & (highest >= -PLANE_SLACK))
 
 
 def _cross(first: Floats, second: Floats) -> npt.NDArray[np.bool_]:
     """Return whether an edge of either triangle pierces the other: (N,), of corners (N, 3, 3)."""
     pierces = np.zeros(len(first), dtype=bool)
     for triangles, cutters in ((first, second), (second, first)):
-        # Most neighbours lie on one side of each other's plane, and are done with here.
         sides = _sides(cutters, triangles)
         straddling = np.flatnonzero((sides.min(axis=1) < 0.0) & (sides.max(axis=1) > 0.0))
         for corner in range(3):
@@ -223,18 +213,24 @@ def _cross_product(a: Floats, b: Floats) -> Floats:
 # ---- Distances
 
 
-def find_touch(points: Floats, mesh: TriangleMesh, reach: float) -> Touch | None:
-    """Return a vertex of points (V, 3) that is nearer to a triangle than `reach` [m].
+def find_touch(
+    first: TriangleMesh, second: TriangleMesh, reach: float, workload: Workload
+) -> Touch | None:
+    """Return a vertex of a mesh that is nearer to a triangle of another one than `reach` [m].
 
-    None if none is.
+    None if none is. Raises TooManyPairsError.
     """
-    corners = mesh.corners
-    tree_of_points = BoxTree(points - reach, points + reach)
-    for i, j in overlapping_boxes(tree_of_points, mesh.tree):
-        distances = _distances(points[i], corners[j])
-        near = distances < reach
-        if near.any():
-            number = int(np.argmax(near))
+    normals, offsets = second.planes
+    trees = (first.tree_of_vertices, second.tree)
+    for i, j in overlapping_boxes(*trees, workload, reach=reach):
+        # A triangle is no nearer than its plane.
+        heights = np.abs(_dot(first.vertices[i], normals[j]) - offsets[j])
+        is_near = heights < reach + PLANE_SLACK
+        i, j = i[is_near], j[is_near]
+        distances = _distances(first.vertices[i], second.corners[j])
+        touches = distances < reach
+        if touches.any():
+            number = int(np.argmax(touches))
             return Touch(int(i[number]), int(j[number]), float(distances[number]))
     return None
 
@@ -261,7 +257,9 @@ def _distances(points: Floats, triangles: Floats) -> Floats:
 # ---- Rays
 
 
-def ray_lengths(mesh: TriangleMesh, points: Floats, direction: Floats, farthest: float) -> Floats:
+def ray_lengths(
+    mesh: TriangleMesh, points: Floats, direction: Floats, farthest: float, workload: Workload
+) -> Floats:
     """Return how far rays from points (N, 3) go until they meet a mesh, (N,) [m]; inf: never.
 
     Args:
@@ -269,6 +267,10 @@ def ray_lengths(mesh: TriangleMesh, points: Floats, direction: Floats, farthest:
         points: Where the rays begin [m].
         direction: Of all rays, of length 1: (3,).
         farthest: Length at which rays end [m].
+        workload: The comparisons that are allowed.
+
+    Raises:
+        TooManyPairsError: The workload ends.
     """
     # In axes of which the last is along the rays, a ray meets what it meets seen from its end.
     axes = np.linalg.svd(direction[None])[2][[1, 2, 0]]
@@ -277,7 +279,7 @@ def ray_lengths(mesh: TriangleMesh, points: Floats, direction: Floats, farthest:
     starts = points @ axes.T
     lengths = np.full(len(points), np.inf)
     rays = BoxTree(starts, starts + np.array([0.0, 0.0, farthest]))
-    for i, j in overlapping_boxes(rays, rotated.tree):
+    for i, j in overlapping_boxes(rays, rotated.tree, workload):
         heights = _heights(starts[i, :2], rotated.corners[j])
         ahead = heights >= starts[i, 2]
         np.minimum.at(lengths, i[ahead], heights[ahead] - starts[i[ahead], 2])

@@ -4,7 +4,7 @@ The paths are those of the simulation core: monotone cubics through keyframes [F
 1980], or straight lines with ramps.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,12 @@ SAMPLES_PER_STEP = 2
 SAMPLED_STEPS = 2
 """Steps before and after each key in which a motion is sampled: cubics bend most at their ends."""
 
+DENSE_ROWS = 4
+"""Rows of even instants, each shifted by a part of their distance, where keys are dense."""
+
+INSTANTS_AT_ONCE = 20_000
+"""Instants whose windows are sampled in one operation: bounds the memory to 30 MB."""
+
 
 def rotation_matrix(turn: Floats) -> Floats:
     """Return the matrix (3, 3) of a rotation vector (3,) [rad] [Rodrigues]."""
@@ -41,6 +47,16 @@ def rotation_matrix(turn: Floats) -> Floats:
     whole = np.rint(matrix)
     is_right = bool((np.abs(matrix - whole) < 1e-12).all())
     return whole + 0.0 if is_right else np.asarray(matrix)
+
+
+def _rotation_matrices(turns: Floats) -> Floats:
+    """Return the matrices (T, 3, 3) of rotation vectors (T, 3) [rad] [Rodrigues]."""
+    angles = np.linalg.norm(turns, axis=1)
+    x, y, z = (turns / np.maximum(angles, 1e-300)[:, None]).T
+    zero = np.zeros_like(x)
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+    sines, cosines = np.sin(angles)[:, None, None], np.cos(angles)[:, None, None]
+    return np.asarray(np.eye(3) + sines * cross + (1.0 - cosines) * (cross @ cross))
 
 
 class Track:
@@ -80,14 +96,22 @@ class Track:
         return self._on_lines(times) if self._is_linear else self._on_cubics(times)
 
     def _on_lines(self, times: Floats) -> Floats:
+        # At key k the velocity changes by c_k, evenly for the ramp r. With s = t - t_k,
+        #     x(t) = x_0 + sum_(s >= r) c_k (s - r / 2) + sum_(0 <= s < r) c_k s^2 / (2 r)
+        # Sums of c_k, c_k t_k and c_k t_k^2 up to each key give it without a loop over the keys.
         slopes = np.diff(self.values, axis=0) / np.diff(self.times)[:, None]
         still = np.zeros((1, 6))
-        changes = np.diff(np.concatenate([still, slopes, still]), axis=0)
-        since = np.clip(times[:, None] - self.times, 0.0, None)
-        # The speed changes evenly for the ramp, and is constant after it.
-        ramping = 0.5 * since * since / (self._ramp or 1.0)
-        travelled = np.where(since < self._ramp, ramping, since - 0.5 * self._ramp)
-        return np.asarray(self.values[0] + travelled @ changes)
+        # Large terms cancel, so the sums have more digits than the result.
+        changes = np.diff(np.concatenate([still, slopes, still]), axis=0).astype(np.longdouble)
+        instants = self.times[:, None].astype(np.longdouble)
+        terms = np.concatenate([changes, changes * instants, changes * instants**2], axis=1)
+        sums = np.concatenate([np.zeros((1, 18), np.longdouble), np.cumsum(terms, axis=0)])
+        of_passed = sums[np.searchsorted(self.times, times - self._ramp, side="right")]
+        of_ramping = sums[np.searchsorted(self.times, times, side="right")] - of_passed
+        t = times[:, None].astype(np.longdouble)
+        passed = (t - 0.5 * self._ramp) * of_passed[:, :6] - of_passed[:, 6:12]
+        ramping = t * t * of_ramping[:, :6] - 2.0 * t * of_ramping[:, 6:12] + of_ramping[:, 12:]
+        return np.asarray(self.values[0] + passed + ramping / (2.0 * (self._ramp or 1.0)), float)
 
     def _on_cubics(self, times: Floats) -> Floats:
         clipped = np.clip(times, self.times[0], self.times[-1])
@@ -121,15 +145,38 @@ class Track:
             begin = float(self._spin["begin"])
             angle = abs(self._spin["speed"]) * step if begin < end else 0.0
             return begin, radius * float(_arc_height(np.array(angle)))
+        size, begin = max(
+            (self._largest_bend(windows, radius) for windows in self._windows(step, end)),
+            default=(0.0, 0.0),
+        )
+        return begin, size
+
+    def _windows(self, step: float, end: float) -> Iterator[Floats]:
+        """Yield instants (W, N) [s], in rows of even distance, at which it may bend most."""
         half = step / SAMPLES_PER_STEP
+        last = min(float(self.times[-1]) + self._ramp, end)
+        first = max(float(self.times[0]) - step, 0.0)
         reach = SAMPLED_STEPS * SAMPLES_PER_STEP
         offsets = half * np.arange(-reach, reach + 1)
         # Cubics bend most at the keys, and turn fastest in the middle between two.
         instants = np.concatenate([self.times, 0.5 * (self.times[1:] + self.times[:-1])])
-        windows = np.maximum(instants[instants < end, None] + offsets, 0.0)
-        if not windows.size:
-            return 0.0, 0.0
+        instants = instants[instants < end]
+        count = int((last + step - first) / half) + 1
+        # Where keys are dense, their windows overlap, and even rows of all instants are shorter.
+        if DENSE_ROWS * count < len(instants) * len(offsets):
+            for row in range(DENSE_ROWS):
+                even = first + half * (row / DENSE_ROWS + np.arange(count))
+                yield np.asarray(even[None], float)
+            return
+        for begin in range(0, len(instants), INSTANTS_AT_ONCE):
+            chosen = instants[begin : begin + INSTANTS_AT_ONCE, None]
+            yield np.asarray(np.maximum(chosen + offsets, 0.0), float)
+
+    def _largest_bend(self, windows: Floats, radius: float) -> tuple[float, float]:
+        """Return the largest distance from an even motion in windows [m], and its time [s]."""
         samples = self.at(windows.ravel()).reshape(*windows.shape, 6)
+        if windows.shape[1] < 3:
+            return 0.0, 0.0
         # The second difference: how far the middle of a step is from that of its ends.
         bends = 0.5 * np.abs(samples[:, 2:] - 2.0 * samples[:, 1:-1] + samples[:, :-2])
         moved = np.linalg.norm(bends[..., :3], axis=-1)
@@ -137,28 +184,41 @@ class Track:
         # What turns evenly leaves the straight line between the ends of a step all the same.
         angles = np.linalg.norm(samples[:, 2:, 3:] - samples[:, :-2, 3:], axis=-1)
         size = np.maximum(moved, np.maximum(turned, _arc_height(angles)) * radius)
-        key, sample = np.unravel_index(int(np.argmax(size)), size.shape)
-        return float(windows[key, sample]), float(size[key, sample])
+        row, sample = np.unravel_index(int(np.argmax(size)), size.shape)
+        return float(size[row, sample]), float(windows[row, sample])
 
-    def moved(self, points: Floats, middle: Floats, time: float) -> Floats:
-        """Return points (K, 3) [m] of the start where the motion has taken them at a time [s].
+    def moved(self, points: Floats, middle: Floats, times: Floats) -> Floats:
+        """Return points (K, 3) [m] of the start where the motion has taken them: (T, K, 3) [m].
 
-        `middle` is that of what moves. A spin does not take them anywhere here.
+        `middle` is that of what moves, and `times` are (T,) [s]. A spin does not take them anywhere
+        here.
         """
         about = middle if self._about is None else np.array(self._about, float)
-        begin, now = self.at(np.array([0.0, time]))
+        begin = self.at(np.zeros(1))[0]
+        now = self.at(times)
         # A holder takes its vertices where they are, so the motion at 0 s is undone first.
-        turn = rotation_matrix(now[3:]) @ rotation_matrix(begin[3:]).T
-        return np.asarray((points - about - begin[:3]) @ turn.T + about + now[:3])
+        turns = _rotation_matrices(now[:, 3:]) @ rotation_matrix(begin[3:]).T
+        moved = np.einsum("kj,tij->tki", points - about - begin[:3], turns)
+        return np.asarray(moved + about + now[:, None, :3])
 
-    def displacements(self) -> tuple[Floats, Floats]:
-        """Return displacements since 0 s at all keys (K, 3) [m], and the times (K,) they end [s].
+    @property
+    def is_translation(self) -> bool:
+        """False if it turns: where its parts are then depends on their shape."""
+        return self._spin is None and not np.any(self.values[:, 3:])
 
-        A motion that turns has none: where its parts are depends on their shape.
-        """
-        if self._spin is not None or np.any(self.values[:, 3:]):
-            return np.empty((0, 3)), np.empty(0)
-        return self.values[:, :3] - self.values[0, :3], self.times + self._ramp
+    @property
+    def moves(self) -> bool:
+        """Whether a translation goes anywhere."""
+        return bool(np.any(self.values[:, :3] != self.values[0, :3]))
+
+    @property
+    def end_times(self) -> Floats:
+        """When it has reached the keys (K,) [s]."""
+        return np.asarray(self.times + self._ramp)
+
+    def displacements(self, times: Floats) -> Floats:
+        """Return the displacements of a translation since 0 s, (T, 3) [m], at times (T,) [s]."""
+        return np.asarray(self.at(times)[:, :3] - self.values[0, :3])
 
 
 def _arc_height(angles: Floats) -> Floats:

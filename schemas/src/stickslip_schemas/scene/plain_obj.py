@@ -53,7 +53,7 @@ def read_tables(text: bytes, *, with_pattern: bool, farthest: float) -> ObjTable
     texture: Floats | None = np.empty((0, 2))
     if with_pattern:
         texture = _coordinates(_TEXTURE.findall(text), 2, farthest)
-    faces = _Words(_FACE.findall(text))
+    faces = Words(_FACE.findall(text))
     indices = _indices(faces)
     if positions is None or texture is None or indices is None:
         return None
@@ -73,7 +73,7 @@ def _are_within(indices: Indices, count: int) -> bool:
     return bool(indices.min() >= 0 and indices.max() < count)
 
 
-class _Words:
+class Words:
     """The words of lines, counted without a Python object for each."""
 
     def __init__(self, lines: list[bytes]) -> None:
@@ -89,8 +89,9 @@ class _Words:
 
     def marks(self, mark: bytes) -> Indices:
         """Return how often a character stands in each word."""
-        is_mark = np.frombuffer(self.text, np.uint8) == ord(mark)
-        return np.asarray(np.add.reduceat(is_mark, self.begins, dtype=np.int64))
+        places = np.flatnonzero(np.frombuffer(self.text, np.uint8) == ord(mark))
+        before = np.searchsorted(places, np.append(self.begins, len(self.text)))
+        return np.diff(before)
 
 
 def _parsed(text: bytes, dtype: type) -> npt.NDArray[Any] | None:
@@ -106,7 +107,7 @@ def _parsed(text: bytes, dtype: type) -> npt.NDArray[Any] | None:
 
 def _coordinates(lines: list[bytes], count: int, farthest: float) -> Floats | None:
     """Return the first numbers of lines (N, count); None if a line has too few or others."""
-    words = _Words(lines)
+    words = Words(lines)
     if not len(words.counts) or words.counts.min() < count or np.ptp(words.counts):
         return None
     numbers = _parsed(words.text, np.float64)
@@ -117,7 +118,7 @@ def _coordinates(lines: list[bytes], count: int, farthest: float) -> Floats | No
     return np.ascontiguousarray(table) if (np.abs(table) <= farthest).all() else None
 
 
-def _indices(faces: _Words) -> Indices | None:
+def _indices(faces: Words) -> Indices | None:
     """Return the indices of corners, (C, 1) or (C, 2 or 3); None if they are of several kinds."""
     if faces.counts.min() < 3:
         return None

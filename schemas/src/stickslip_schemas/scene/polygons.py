@@ -20,6 +20,9 @@ MAX_CORNERS = 1_000
 MAX_CUTTING_WORK = 2_000_000
 """Sum of the squares of the corners of all faces that no fan covers: about 2 s of CPU time."""
 
+_WEIGHTS = (1.0, 0.7548776662466927, 0.5698402909980532, 0.8191725133961645, 0.6710436067037893)
+"""Weights of the columns of rows in a sum that different rows seldom share: no simple ratios."""
+
 _FLAT = 1e-9
 """Area of a triangle over that of its polygon below which it counts as flat."""
 
@@ -38,6 +41,9 @@ def weld(columns: Floats) -> Weld:
 
     Equal means equal bit by bit, but for the sign of zero: files write one position in one way.
     """
+    count = len(columns)
+    if not _may_repeat(columns):
+        return Weld(np.arange(count), np.arange(count))
     # Adding 0.0 turns -0.0 into 0.0.
     _, first, inverse = np.unique(columns + 0.0, axis=0, return_index=True, return_inverse=True)
     # `unique` orders by value. Order by first appearance instead, so that a mesh without duplicates
@@ -46,6 +52,24 @@ def weld(columns: Floats) -> Weld:
     ranks = np.empty_like(order)
     ranks[order] = np.arange(len(order))
     return Weld(first[order], ranks[inverse.reshape(-1)])
+
+
+def repeated_numbers(numbers: Indices) -> Indices:
+    """Return each number after the first that is equal to it, ascending: of 5, 5, 5 two."""
+    ordered = np.sort(numbers)
+    return np.asarray(ordered[1:][ordered[1:] == ordered[:-1]])
+
+
+def _may_repeat(columns: Floats) -> bool:
+    """Return False if no two rows of `columns` (N, K) are equal: comparing rows takes longer."""
+    if columns.shape[1] > len(_WEIGHTS):
+        return True
+    # Equal rows have equal sums.
+    sums = np.zeros(len(columns))
+    for column, weight in zip(columns.T, _WEIGHTS, strict=False):
+        sums += weight * column
+    sums.sort()
+    return bool((sums[1:] == sums[:-1]).any())
 
 
 def triangulate(points: Floats, corners: Indices, sizes: Indices) -> Indices:

@@ -3,10 +3,12 @@
 The rules are those of the simulation core, found here by geometry alone, so that a coordinator
 without the core refuses a scene before anything is queued:
 
+    sizes       triangles of bodies and rows of paths within what can be compared (`sizes`)
     sheets      together within the size that the solver takes, thinner than their cells, each in
                 one piece
     holders     hold a vertex each, none twice, and leave one free
     bodies      are round against the cells of the sheets
+    gaps        are not so large that units must differ
     start       no sheet inside a body, across another thing, or at no distance from it
     motions     no faster than the shortest steps of the preset can follow
     holders     do not tear the cloth between them
@@ -21,9 +23,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from stickslip_schemas.scene.box_trees import MAX_COMPARED_PAIRS, TooManyPairsError, Workload
 from stickslip_schemas.scene.errors import UnfitStartError
 from stickslip_schemas.scene.geometry import (
     TriangleMesh,
+    are_apart,
     find_crossing,
     find_self_crossing,
     find_touch,
@@ -35,6 +39,7 @@ from stickslip_schemas.scene.parameters import Location
 from stickslip_schemas.scene.presses import press_faults
 from stickslip_schemas.scene.shapes import RADIUS_LEAST, box_rounding, start_gap, with_roundings
 from stickslip_schemas.scene.sheets import SLACK, SheetStart, held_vertices, start_of
+from stickslip_schemas.scene.sizes import gap_faults, size_faults
 from stickslip_schemas.spec.jobs import StartFault
 
 Floats = npt.NDArray[np.float64]
@@ -73,8 +78,12 @@ def find_start_faults(document: Mapping[str, Any]) -> list[StartFault]:
 
     `document` is the physics as JSON, with the arrays of files (`files.with_arrays`).
     """
+    faults = list(size_faults(document))
+    # Nothing is compared in a scene that is too large for it.
+    if faults:
+        return faults
     sheets = [start_of(name, sheet) for name, sheet in sorted(document["sheets"].items())]
-    faults = list(_sheet_faults(document, sheets))
+    faults += _sheet_faults(document, sheets)
     faults += _holder_faults(document, sheets)
     end = document_end(document)
     faults += motion_faults(document, sheets, end)
@@ -84,13 +93,33 @@ def find_start_faults(document: Mapping[str, Any]) -> list[StartFault]:
     cell = max(sheet.cell for sheet in sheets)
     document = {**document, "bodies": with_roundings(document["bodies"], cell)}
     if not faults:
-        faults += _body_faults(document, sheets)
+        faults += gap_faults(document, sheets)
     if not faults:
-        faults += _contact_faults(document, sheets)
+        faults += _body_faults(document, sheets)
     if not faults:
         faults += stretch_faults(document, sheets, end)
     if not faults:
-        faults += press_faults(document, sheets, end)
+        faults += _crowded_faults(document, sheets, end)
+    return faults
+
+
+def _crowded_faults(
+    document: Mapping[str, Any], sheets: list[SheetStart], end: float
+) -> list[StartFault]:
+    """Return the faults of starts and presses, or that too many triangles are near each other."""
+    workload = Workload(MAX_COMPARED_PAIRS)
+    try:
+        faults = list(_contact_faults(document, sheets, workload))
+        if not faults:
+            faults += press_faults(document, sheets, end, workload)
+    except TooManyPairsError:
+        rule = (
+            f"must be so far from each other and from bodies that at most {MAX_COMPARED_PAIRS} "
+            "pairs of boxes around their triangles have to be compared, as each step of a "
+            "simulation does: cut long slanted triangles into shorter ones, make meshes coarser, "
+            "or move things apart"
+        )
+        return [StartFault(("sheets",), rule, sorted(document["sheets"]))]
     return faults
 
 
@@ -259,7 +288,9 @@ def _held_at_start(document: Mapping[str, Any], sheet: SheetStart) -> npt.NDArra
     return held
 
 
-def _contact_faults(document: Mapping[str, Any], sheets: list[SheetStart]) -> Iterator[StartFault]:
+def _contact_faults(
+    document: Mapping[str, Any], sheets: list[SheetStart], workload: Workload
+) -> Iterator[StartFault]:
     """Yield sheets that cross themselves, other sheets or triangles of bodies, or lie in them."""
     standing = [sheet for sheet in sheets if not sheet.is_hung]
     surfaces = [
@@ -271,7 +302,7 @@ def _contact_faults(document: Mapping[str, Any], sheets: list[SheetStart]) -> It
         self_contact = document["sheets"][sheet.name]["self_contact"]
         # A flat sheet cannot cross itself.
         if self_contact and not sheet.is_flat:
-            crossing = find_self_crossing(sheet.mesh)
+            crossing = find_self_crossing(sheet.mesh, workload)
             if crossing is not None:
                 rule = (
                     f"must not cross itself, and triangle {crossing.first} crosses triangle "
@@ -283,18 +314,21 @@ def _contact_faults(document: Mapping[str, Any], sheets: list[SheetStart]) -> It
         obstacles = [(f"sheet {other.name}", other.mesh) for other in standing[:number]]
         obstacles += [(f"body {name}", mesh) for name, mesh in surfaces]
         for name, mesh in obstacles:
-            rule = _meeting(sheet, name, mesh)
+            rule = _meeting(sheet, name, mesh, workload)
             if rule:
                 location = ("sheets", sheet.name, "origin")
                 yield StartFault(location, rule, _origin(document, sheet))
                 break
     for sheet in sheets:
         if sheet.is_hung:
-            yield from _hung_faults(document, sheet, surfaces)
+            yield from _hung_faults(document, sheet, surfaces, workload)
 
 
 def _hung_faults(
-    document: Mapping[str, Any], sheet: SheetStart, surfaces: list[tuple[str, TriangleMesh]]
+    document: Mapping[str, Any],
+    sheet: SheetStart,
+    surfaces: list[tuple[str, TriangleMesh]],
+    workload: Workload,
 ) -> Iterator[StartFault]:
     """Yield the body of triangles that a hung sheet crosses wherever in its plane it may be."""
     positions = hung_positions(document, sheet)
@@ -307,7 +341,7 @@ def _hung_faults(
         TriangleMesh(positions + side * shift, sheet.mesh.triangles) for side in (0.0, -1.0, 1.0)
     ]
     for name, mesh in surfaces:
-        crossings = [find_crossing(side, mesh) for side in sides]
+        crossings = [find_crossing(side, mesh, workload) for side in sides]
         if crossings[0] is None or None in crossings:
             continue
         rule = (
@@ -319,11 +353,13 @@ def _hung_faults(
         return
 
 
-def _meeting(sheet: SheetStart, name: str, mesh: TriangleMesh) -> str:
+def _meeting(sheet: SheetStart, name: str, mesh: TriangleMesh, workload: Workload) -> str:
     """Return the rule that a sheet breaks with another thing; an empty text if it breaks none."""
-    touch = find_touch(sheet.mesh.vertices, mesh, LEAST_DISTANCE)
+    if are_apart(sheet.mesh, mesh, LEAST_DISTANCE):
+        return ""
+    touch = find_touch(sheet.mesh, mesh, LEAST_DISTANCE, workload)
     # Two meshes that lie in each other have millions of candidates, and a fault already.
-    crossing = find_crossing(sheet.mesh, mesh, batches=None if touch is None else 1)
+    crossing = find_crossing(sheet.mesh, mesh, workload, batches=None if touch is None else 1)
     if crossing is not None:
         return (
             f"must not cross {name} at the start, and triangle {crossing.first} of the sheet "
@@ -338,7 +374,7 @@ def _meeting(sheet: SheetStart, name: str, mesh: TriangleMesh) -> str:
             f"{_point(sheet, touch.vertex)}; {remedy}"
         )
     # Where the other thing is the smaller one, its vertices lie in the sheet.
-    touch = find_touch(mesh.vertices, sheet.mesh, LEAST_DISTANCE)
+    touch = find_touch(mesh, sheet.mesh, LEAST_DISTANCE, workload)
     if touch is not None:
         point = _coordinates(mesh.vertices[touch.vertex].tolist())
         return (

@@ -1,5 +1,6 @@
 """Errors of pydantic in the words of people who write specs."""
 
+import math
 import re
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -29,6 +30,13 @@ PATTERN_RULES = {
 """The rule of each pattern of our documents, in words: nobody has to read an expression."""
 
 
+_OTHER_UNITS: Mapping[str, tuple[str, float]] = {
+    "m": ("mm", 1e-3),
+    "rad": ("degrees", math.pi / 180),
+}
+"""The unit that people write instead of ours, and the factor between both."""
+
+
 class Explanation(NamedTuple):
     """An error of pydantic in words."""
 
@@ -48,7 +56,26 @@ def explain(item: ErrorDetails, expected: Any) -> Explanation:
     compared with its fields and values.
     """
     explanation = _EXPLANATIONS.get(item["type"], _explain_other)(item, expected)
-    return explanation._replace(rule=explanation.rule + unit_of(item, expected))
+    unit = unit_of(item, expected)
+    hint = _other_unit_hint(item, unit.strip(" []"))
+    return explanation._replace(rule=explanation.rule + unit + hint)
+
+
+def _other_unit_hint(item: ErrorDetails, unit: str) -> str:
+    """Return a question for another unit, in which a number beyond a limit would be within it."""
+    limit = item.get("ctx", {}).get(
+        {"less_than_equal": "le", "greater_than_equal": "ge"}.get(item["type"], "")
+    )
+    value = item["input"]
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if limit is None or not is_number or unit not in _OTHER_UNITS:
+        return ""
+    other, factor = _OTHER_UNITS[unit]
+    converted = factor * value
+    # A length that is too small is not one in millimetres.
+    if abs(value) < abs(limit) or abs(converted) > abs(limit):
+        return ""
+    return f"; did you mean {other}? {value:g} {other} are {converted:.6g} {unit}"
 
 
 _Explain = Callable[[ErrorDetails, Any], Explanation]

@@ -337,6 +337,16 @@ class MeasuredFabric(NamedTuple):
     """Rigidities along the warp, along the weft, and at 45 degrees [N m]."""
     bending_length: tuple[float, float]
     """Along the warp and the weft [mm]."""
+    drape: float
+    """Drape coefficient by Cusick's test, simulated [%]: see docs/reality.md for its accuracy."""
+    folds: int
+    """Folds of the draped disc."""
+
+    @property
+    def words(self) -> str:
+        """Bending length and drape in words."""
+        warp, weft = self.bending_length
+        return f"bending length {warp:g} and {weft:g} mm, drape coefficient {self.drape:.0f} %"
 
 
 @cache
@@ -350,6 +360,8 @@ def measured_fabrics() -> Mapping[str, MeasuredFabric]:
                 facts["density"],
                 tuple(facts["bending"]),
                 tuple(facts["bending_length"]),
+                facts["drape"],
+                facts["folds"],
             )
             for name, facts in table.items()
         }

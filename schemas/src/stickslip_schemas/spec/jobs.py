@@ -29,6 +29,7 @@ from stickslip_schemas.spec import arrays
 from stickslip_schemas.spec.arrays import COMMON_ARRAYS, ArrayLayout
 from stickslip_schemas.spec.axes import MAX_SAMPLES, AnyAxis, ListAxis, Seed, axis_values
 from stickslip_schemas.spec.cameras import Camera
+from stickslip_schemas.spec.reality import Subject
 from stickslip_schemas.spec.resolution import Resolution, resolution_field
 
 D = TypeVar("D", bound=Document)
@@ -208,6 +209,8 @@ class JobSpec(Document):
     simulation_seeds: ClassVar[tuple[SeedRule, ...]] = ()
     render_seeds: ClassVar[tuple[SeedRule, ...]] = ()
     variant_axis: ClassVar[str | None] = None
+    subject: ClassVar[Subject | None] = None
+    """What measurements are about, to compare with; None if there are none: see `reality`."""
     has_scene: ClassVar[bool] = False
     """True if samples start in a scene, which may be impossible: see `start_faults`."""
     """The axis whose values differ between renders that can be made together, if there is one."""

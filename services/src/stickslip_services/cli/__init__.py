@@ -35,6 +35,7 @@ _SECTIONS = {
     "Scenes": dict.fromkeys(("scene", "simulate"), "specs"),
     "Fabrics": dict.fromkeys(("fabrics", "lab"), "laboratory"),
     "Certificates": dict.fromkeys(("certify", "register", "certificates"), "workers"),
+    "Measurement": {"measure": "measuring"},
     "Administration": dict.fromkeys(("keys", "projects", "webhooks", "audit-log"), "admin"),
     "Maintenance": dict.fromkeys(("backup", "rm", "gc", "reindex", "scrub"), "maintenance"),
 }

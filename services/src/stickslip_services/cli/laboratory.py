@@ -32,7 +32,7 @@ mu_option = click.option(
 @json_option
 @shows_errors
 def fabrics(as_json: bool) -> None:
-    """List the built-in fabrics, with their rigidities and bending lengths.
+    """List the built-in fabrics, with their bending lengths and drape coefficients.
 
     Each is one measured specimen: another cloth of the same name may be twice as stiff.
     """
@@ -41,7 +41,7 @@ def fabrics(as_json: bool) -> None:
         print_json({name: facts._asdict() for name, facts in table.items()})
         return
     rows = [(name, *_fabric_cells(facts)) for name, facts in table.items()]
-    heads = ("fabric", "g/m2", "D warp, weft uN m", "bending length mm")
+    heads = ("fabric", "g/m2", "D warp, weft uN m", "bending length mm", "drape %")
     print_table(heads, rows)
 
 
@@ -51,6 +51,7 @@ def _fabric_cells(facts: MeasuredFabric) -> tuple[str, ...]:
         f"{1e3 * facts.density:.0f}",
         f"{warp:.1f}, {weft:.1f}",
         f"{facts.bending_length[0]:.1f}, {facts.bending_length[1]:.1f}",
+        f"{facts.drape:.0f}",
     )
 
 

@@ -180,9 +180,11 @@ def mean_speed(workers: Collection[RegisteredWorker]) -> MachineSpeed:
     slots = sum(worker.condition.slots for worker in workers)
     if slots == 0:
         return MachineSpeed()
-    cpu_speed = sum(w.condition.slots * w.condition.speed.cpu_speed for w in workers)
-    cpu_available = sum(w.condition.slots * w.condition.speed.cpu_available for w in workers)
-    return MachineSpeed(cpu_speed=cpu_speed / slots, cpu_available=cpu_available / slots)
+    means = {}
+    for name in MachineSpeed.model_fields:
+        total = sum(w.condition.slots * getattr(w.condition.speed, name) for w in workers)
+        means[name] = total / slots
+    return MachineSpeed(**means)
 
 
 def count_slots(workers: Collection[RegisteredWorker], kind: str, builds: Builds) -> int:

@@ -6,6 +6,7 @@ The card is for people who find only the directory. The preview has some samples
 import json
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,9 @@ from stickslip_schemas.format.manifest import Manifest, layout
 from stickslip_schemas.format.pictures import labelled, moving, sheet
 from stickslip_schemas.spec.arrays import ArrayLayout, shown_frames
 from stickslip_schemas.spec.axes import AnyAxis, ListAxis
+from stickslip_schemas.spec.fabrics import measured_fabrics
 from stickslip_schemas.spec.jobs import JobSpec
+from stickslip_schemas.spec.reality import Reality, Subject, reality
 
 CARD_NAME = "README.md"
 PREVIEW_NAME = "preview.webp"
@@ -81,6 +84,7 @@ def card(manifest: Manifest) -> bytes:
         _table(("part", "build (SHA-256 of its code)"), list(manifest.builds.model_dump().items())),
         _certificate(manifest),
         *_pictures(manifest),
+        *_against_measurements(spec.subject),
         f"The spec, whose digest is `{manifest.spec_digest}`:",
         f"```json\n{json.dumps(document, indent=2)}\n```",
         "## How to read it",
@@ -148,6 +152,52 @@ def _certificate(manifest: Manifest) -> str:
     )
 
 
+def _against_measurements(subject: Subject | None) -> list[str]:
+    """Return the comparison of the model with measurements, and what it leaves out."""
+    if subject is None:
+        return []
+    facts = reality()
+    missing = [(item.missing, item.size) for item in facts.missing_of(subject)]
+    return [
+        f"### Against measurements, of {facts.date}",
+        "The certificate compares the solver with formulas. These facts compare the model with "
+        "real things; no run of the service measures them.",
+        *_COMPARED[subject](facts),
+        "### What the model leaves out",
+        _table(("missing", "size"), missing),
+    ]
+
+
+def _compared_cloth(facts: Reality) -> list[str]:
+    rows = [
+        (
+            f"`{name}`",
+            f"{fabric.bending_length[0]:g}, {fabric.bending_length[1]:g}",
+            f"{fabric.drape:.0f}",
+        )
+        for name, fabric in measured_fabrics().items()
+    ]
+    bands = [f"{band.name} {band.low:g} to {band.high:g} ({band.source})" for band in facts.bands]
+    return [
+        "A label `mu` is the mu of this model. A built-in fabric is one specimen.",
+        _table(("fabric", "bending length, warp and weft [mm]", "drape [%]"), rows),
+        f"Drape: {facts.drape_source}. Published drape coefficients [%]: {'; '.join(bands)}.",
+    ]
+
+
+def _compared_rods(facts: Reality) -> list[str]:
+    rows = [(f"{fit.length:g}", f"{fit.bending_length:g}") for fit in facts.yarn]
+    return [
+        _table(("overhang of a yarn [mm]", "fitted bending length [mm]"), rows),
+        f"Source: {facts.yarn_source}; {facts.yarn_meaning}.",
+    ]
+
+
+_COMPARED: Mapping[Subject, Callable[[Reality], list[str]]] = MappingProxyType(
+    {"cloth": _compared_cloth, "rods": _compared_rods}
+)
+
+
 def _pictures(manifest: Manifest) -> list[str]:
     pictures = manifest.pictures
     if pictures is None:
@@ -167,7 +217,7 @@ def _pictures(manifest: Manifest) -> list[str]:
     return [text]
 
 
-def _table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+def _table(header: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
     lines = [header, ("---",) * len(header)]
     for row in rows:
         # A bar in a cell would end the cell.

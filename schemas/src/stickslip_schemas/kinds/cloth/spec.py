@@ -177,6 +177,7 @@ class ClipRender(Render):
 class ClipSpec(JobSpec):
     """Base of the specs of cloth: clips of trajectories, and names that users define."""
 
+    subject = "cloth"
     variant_axis = "texture"
     instants: ClassVar[int]
     """How many instants of the motion a trajectory holds."""
@@ -273,7 +274,7 @@ class ClipSpec(JobSpec):
         Measuring the clips of eight textures costs the fraction `measured` of their shading.
         """
         # CPU time of shading a frame [s], fitted to `benchmarks/job_costs.py`.
-        frame_seconds = {"preview": 0.66, "draft": 0.95, "standard": 1.3, "high": 3.3}
+        frame_seconds = {"preview": 0.66, "draft": 0.95, "standard": 1.3, "high": 5.0}
         # Most of it is in the window of the cloth, which grows with the shorter side; the rest is
         # that of the whole frame.
         area = self._mean_over_pictures(prod)

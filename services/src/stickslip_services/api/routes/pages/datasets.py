@@ -12,6 +12,8 @@ from sqlalchemy import Connection
 from stickslip_schemas.documents.certificate import Certificate, Numbers, ProtocolReport
 from stickslip_schemas.format.pictures import png
 from stickslip_schemas.spec.arrays import SPLITS
+from stickslip_schemas.spec.fabrics import measured_fabrics
+from stickslip_schemas.spec.reality import reality
 
 from stickslip_services.addresses import link
 from stickslip_services.api.routes.common import ContextDep
@@ -221,6 +223,8 @@ def get_certificate(digest: str, context: ContextDep) -> Response:
         digest=digest,
         builds=builds,
         plots=plots,
+        reality=reality(),
+        fabrics=measured_fabrics(),
     )
 
 

@@ -1,0 +1,305 @@
+"""The page of a campaign: one screen that says who holds and who creeps, and pictures below."""
+
+import io
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from html import escape
+from pathlib import Path
+from string import Template
+from typing import Any
+
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+
+from stickslip_measure import __version__, experiments
+from stickslip_measure.campaign import MEASURED, Cell, limit, read_cells
+from stickslip_measure.diagnosis import CREEP, findings, row_of
+from stickslip_measure.laboratory import Experiment
+
+GOOD = 0.01
+"""Largest error of a cell that is marked as good."""
+
+FAIR = 0.05
+"""Largest error of a cell that is marked as fair."""
+
+STYLES = ("-", "--", ":", "-.")
+COLOURS = ("#1f6f8b", "#c2571a", "#4a7c2a", "#7b4fa3", "#a8324a", "#6b6b00")
+
+Row = tuple[str, str]
+"""Simulator and row of its settings."""
+
+
+def write_page(out: Path) -> Path:
+    """Write OUT/index.html from all cells of a folder, and return its path.
+
+    Raises:
+        ValueError: A file of the folder is no cell.
+    """
+    rows = rows_of(read_cells(out))
+    simulators = read_simulators(out)
+    text = TEMPLATE.substitute(
+        version=escape(__version__),
+        overview=overview(rows),
+        findings="".join(finding_items(rows)),
+        experiments="".join(section(experiment, rows) for experiment in chosen(rows)),
+        simulators="".join(simulator_text(facts) for facts in simulators),
+    )
+    page = out / "index.html"
+    page.write_text(text, encoding="utf-8")
+    return page
+
+
+def rows_of(cells: Sequence[Cell]) -> dict[Row, list[Cell]]:
+    """Return the cells of each row of each simulator."""
+    rows: dict[Row, list[Cell]] = {}
+    for cell in cells:
+        rows.setdefault((cell.simulator, cell.row), []).append(cell)
+    return rows
+
+
+def read_simulators(out: Path) -> list[Mapping[str, Any]]:
+    """Return the descriptions of all simulators of a folder."""
+    paths = sorted(out.glob("*/simulator.json"))
+    return [json.loads(path.read_text(encoding="utf-8")) for path in paths]
+
+
+def chosen(rows: Mapping[Row, Sequence[Cell]]) -> Iterator[Experiment]:
+    """Yield the checks and experiments that some row has."""
+    names = {cell.experiment for cells in rows.values() for cell in cells}
+    for experiment in (*experiments.CHECKS.values(), *experiments.EXPERIMENTS.values()):
+        if experiment.name in names:
+            yield experiment
+
+
+def at_default(cells: Sequence[Cell], experiment: Experiment) -> Cell | None:
+    """Return the cell of the default resolution, if it was measured."""
+    for cell in cells:
+        if cell.experiment == experiment.name and cell.cells == experiment.default:
+            return cell
+    return None
+
+
+def overview(rows: Mapping[Row, Sequence[Cell]]) -> str:
+    """Return the table of the first screen."""
+    heads = "".join(
+        f'<th><a href="#{name}">{escape(name.replace("-", " "))}</a></th>'
+        for name in experiments.EXPERIMENTS
+    )
+    lines = [f"<tr><th>simulator</th><th>row</th><th>verdict</th>{heads}</tr>"]
+    for (simulator, row), cells in rows.items():
+        entries = "".join(entry(cells, each) for each in experiments.EXPERIMENTS.values())
+        lines.append(
+            f"<tr><th>{escape(simulator)}</th><td>{escape(row)}</td>{verdict(cells)}{entries}</tr>"
+        )
+    return "\n".join(lines)
+
+
+def verdict(cells: Sequence[Cell]) -> str:
+    """Return whether cloth holds at 90 % of the angle of slip, as an entry of the table."""
+    cell = at_default(cells, experiments.EXPERIMENTS["creep"])
+    if cell is None:
+        return '<td class="none">not asked</td>'
+    if cell.value is None:
+        word = "sleeps" if cell.state == "sleeps" else "no answer"
+        return f'<td class="poor" title="{escape(cell.reason)}">{word}</td>'
+    if cell.value < CREEP:
+        return '<td class="good">holds</td>'
+    return '<td class="poor">creeps</td>'
+
+
+def entry(cells: Sequence[Cell], experiment: Experiment) -> str:
+    """Return the error at the default resolution, or the reason why there is none."""
+    cell = at_default(cells, experiment)
+    if cell is None:
+        return '<td class="none">–</td>'
+    if cell.state != MEASURED:
+        return f'<td class="none" title="{escape(cell.reason)}">{escape(cell.state)}</td>'
+    return f'<td class="{grade(cell, experiment)}">{error_text(cell, experiment)}</td>'
+
+
+def grade(cell: Cell, experiment: Experiment) -> str:
+    """Return the mark of an error: good, fair or poor."""
+    error = abs(cell.error or 0.0)
+    # The error of the creep is a displacement.
+    if experiment.unit == "mm":
+        return "good" if error < CREEP else "poor"
+    if error <= GOOD:
+        return "good"
+    return "fair" if error <= FAIR else "poor"
+
+
+def error_text(cell: Cell, experiment: Experiment) -> str:
+    """Return an error with its unit."""
+    error = cell.error
+    if error is None:
+        return "–"
+    if experiment.unit:
+        return f"{error:.2g} {escape(experiment.unit)}"
+    return f"{100.0 * error:+.2f} %"
+
+
+def finding_items(rows: Mapping[Row, Sequence[Cell]]) -> Iterator[str]:
+    """Yield the faults of all rows as items of a list."""
+    for (simulator, row), cells in rows.items():
+        for finding in findings(cells):
+            head = escape(f"{simulator}, {row}: {finding.fault}.")
+            yield f"<li><strong>{head}</strong> {escape(finding.evidence)}</li>"
+
+
+def section(experiment: Experiment, rows: Mapping[Row, Sequence[Cell]]) -> str:
+    """Return the section of an experiment: formula, table, picture."""
+    lines = []
+    for (simulator, row), cells in rows.items():
+        measured = row_of(cells).get(experiment.name)
+        if measured:
+            lines.append(
+                f"<tr><th>{escape(simulator)}</th><td>{escape(row)}</td>"
+                f"{resolution_entries(experiment, measured)}</tr>"
+            )
+    heads = "".join(f"<th>{cells} cells</th>" for cells in experiment.cells)
+    return SECTION.substitute(
+        name=experiment.name,
+        title=escape(experiment.title),
+        formula=escape(experiment.formula),
+        quantity=escape(experiment.quantity),
+        heads=heads,
+        lines="\n".join(lines),
+        picture=picture(experiment, rows),
+    )
+
+
+def resolution_entries(experiment: Experiment, measured: Sequence[Cell]) -> str:
+    """Return values, limit, order, error and cost of an experiment as entries of its table."""
+    by_cells = {cell.cells: cell for cell in measured}
+    entries = []
+    for cells in experiment.cells:
+        cell = by_cells.get(cells)
+        if cell is None:
+            entries.append("<td>–</td>")
+        elif cell.value is None:
+            entries.append(f'<td class="reason">{escape(cell.state)}: {escape(cell.reason)}</td>')
+        else:
+            entries.append(f"<td>{cell.value:.5g}</td>")
+    limit_value, order = limit(measured)
+    entries.append(f"<td>{number(limit_value)}</td><td>{number(order)}</td>")
+    cell = by_cells.get(experiment.default)
+    entries.append(f"<td>{error_text(cell, experiment) if cell is not None else '–'}</td>")
+    entries.append(f"<td>{sum(cell.cpu for cell in measured):.1f}</td>")
+    return "".join(entries)
+
+
+def number(value: float) -> str:
+    """Return a number, or a dash for none."""
+    return "–" if math.isnan(value) else f"{value:.4g}"
+
+
+def picture(experiment: Experiment, rows: Mapping[Row, Sequence[Cell]]) -> str:
+    """Return the curves of all rows at the default resolution, beside the closed form, as SVG."""
+    # Text stays text, so that the page can be searched; a fixed salt gives the same file twice.
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": experiment.name, "font.size": 9}):
+        figure = Figure(figsize=(6.2, 3.0), layout="constrained")
+        axes = figure.subplots()
+        drawn = 0
+        for index, ((simulator, row), cells) in enumerate(rows.items()):
+            cell = at_default(cells, experiment)
+            if cell is None or not cell.x:
+                continue
+            # All rows have the same closed form, but for the frames of their steps.
+            if not drawn:
+                axes.plot(cell.x, cell.reference, color="0.6", lw=4, label="closed form")
+            style = STYLES[index // len(COLOURS) % len(STYLES)]
+            colour = COLOURS[index % len(COLOURS)]
+            label = f"{simulator}, {row}"
+            marker = "." if len(cell.x) < 30 else ""
+            axes.plot(cell.x, cell.measured, style, marker=marker, color=colour, label=label)
+            drawn += 1
+        if not drawn:
+            return "<p>No row has a value.</p>"
+        axes.set_xlabel(experiment.axes[0])
+        axes.set_ylabel(experiment.axes[1])
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=8)
+        stream = io.StringIO()
+        figure.savefig(stream, format="svg", metadata={"Date": None})
+    # The header of a file does not belong into a page.
+    text = stream.getvalue()
+    svg = text[text.index("<svg") :]
+    label = escape(f"{experiment.title}: {experiment.axes[1]} against {experiment.axes[0]}")
+    return svg.replace("<svg", f'<svg role="img" aria-label="{label}"', 1)
+
+
+def simulator_text(facts: Mapping[str, Any]) -> str:
+    """Return the versions of a simulator, and what its adapter did."""
+    items = []
+    for setting, numbers in facts["settings"].items():
+        pairs = ", ".join(f"{name}: {value}" for name, value in numbers.items())
+        items.append(f"<li><strong>{escape(setting)}</strong>: {escape(pairs)}</li>")
+    return (
+        f"<h3>{escape(facts['name'])} {escape(facts['version'])}</h3>"
+        f"<p>Python {escape(facts['python'])}, NumPy {escape(facts['numpy'])}. Can: "
+        f"{escape(', '.join(facts['capabilities']))}. Clearance {facts['clearance']:g} m, gap "
+        f"{facts['gap']:g} m.</p><ul>{''.join(items)}</ul>"
+    )
+
+
+SECTION = Template("""
+<section id="$name">
+<h3>$title</h3>
+<p>Closed form: $formula. Value: $quantity.</p>
+<div class="wide"><table>
+<tr><th>simulator</th><th>row</th>$heads<th>limit</th><th>order</th><th>error</th>
+<th>CPU s</th></tr>
+$lines
+</table></div>
+$picture
+</section>
+""")
+
+TEMPLATE = Template("""<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>Yardstick: friction and bending of simulators</title>
+<style>
+:root { color-scheme: light dark; }
+body { font: 15px/1.45 system-ui, sans-serif; margin: 1rem auto; max-width: 1240px;
+  padding: 0 1rem; color: #1b1f23; background: #fff; }
+h1 { font-size: 1.4rem; margin: 0 0 .3rem; }
+table { border-collapse: collapse; font-size: 13px; }
+th, td { border: 1px solid #c9ced3; padding: .25rem .4rem; text-align: left; }
+.overview th, .overview td { text-align: center; }
+.overview td { white-space: nowrap; }
+.wide { overflow-x: auto; }
+.good { background: #d5efd8; color: #0d3b16; }
+.fair { background: #fbeec2; color: #4d3b00; }
+.poor { background: #f8d3cf; color: #5c1008; }
+.none { color: #59636e; }
+.reason { max-width: 22rem; }
+section { border-top: 1px solid #c9ced3; margin-top: 1.2rem; }
+svg { background: #fff; max-width: 100%; height: auto; }
+a { color: inherit; }
+@media (prefers-color-scheme: dark) {
+  body { background: #14181c; color: #e4e8eb; }
+  .none { color: #a7b0b8; }
+  th, td, section { border-color: #454d55; }
+}
+</style>
+</head>
+<body>
+<h1>Who holds, and who creeps</h1>
+<p>Errors at the default resolution against closed forms: within 1 % green, within 5 % yellow.
+"Holds" is less than 0.1 mm in 10 s at 90 % of the angle of slip, awake. Friction was calibrated
+nowhere. Made by stickslip-measure $version.</p>
+<div class="wide"><table class="overview">
+$overview
+</table></div>
+<ul>$findings</ul>
+<h2>Experiments</h2>
+$experiments
+<h2>Simulators</h2>
+$simulators
+</body>
+</html>
+""")
