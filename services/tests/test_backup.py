@@ -5,12 +5,14 @@ import shutil
 import subprocess
 import threading
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
 from click.testing import CliRunner, Result
 from stickslip_schemas.format.manifest import MANIFEST_NAME
-from stickslip_schemas.store import DirectoryStore
+from stickslip_schemas.store import DirectoryStore, open_store
+from stickslip_services.app import make_app
 from stickslip_services.cli import app as cli
 from stickslip_services.database.database import Role
 from stickslip_services.database.opening import connect
@@ -20,7 +22,8 @@ from stickslip_services.queue.backup import _copy_store as copy_store
 from stickslip_services.settings import Settings
 from stickslip_testing.invariants import violations
 from stickslip_testing.jobs import rods
-from stickslip_testing.servers import RunningServer, served, wait_until
+from stickslip_testing.servers import HttpApi, RunningServer, served, serving, wait_until
+from stickslip_testing.worker import PretendWorker
 
 
 def backup(settings: Settings, target: Path) -> Result:
@@ -199,9 +202,9 @@ def test_a_damaged_or_deleted_file_is_named(
         damaged, deleted = files[0].name, files[1].name
         server.store.path(damaged).write_bytes(b"\0" * files[0].bytes)
 
-        def copied_after_gc(store: DirectoryStore, target: Path) -> object:
+        def copied_after_gc(store: DirectoryStore, *rest: Any) -> object:
             store.path(deleted).unlink()
-            return copy_store(store, target)
+            return copy_store(store, *rest)
 
         monkeypatch.setattr("stickslip_services.queue.backup._copy_store", copied_after_gc)
         result = backup(settings, tmp_path / "backup")
@@ -231,3 +234,70 @@ def test_a_backup_overwrites_nothing_else(settings: Settings, tmp_path: Path) ->
     empty = backup(Settings(data=tmp_path / "none"), tmp_path / "other")
     assert (empty.exit_code, "does not exist or is empty" in empty.stderr) == (1, True)
     assert json.loads((target / "backup.json").read_text())["store"] == "store"
+
+
+def worker_of(server: RunningServer, place: str) -> PretendWorker:
+    """Return a registered worker that writes to a store at a place."""
+    key = (server.data / "worker-key").read_text().strip()
+    return PretendWorker(HttpApi(server.url, key), open_store(place)).register()
+
+
+def test_a_bucket_is_copied_where_that_is_asked_for(
+    bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The backup is a data directory of its own: a service starts with it, without the bucket."""
+    in_bucket = Settings.chosen(data=tmp_path / "data", store=bucket, durable=False)
+    target = tmp_path / "backup"
+    words = ["backup", str(target), "--data", str(in_bucket.data), "--store", bucket]
+    with serving(make_app(in_bucket)) as url:
+        server = RunningServer(url, in_bucket.data)
+        worker = worker_of(server, bucket)
+        submit(server, (1.0, 2.0), "first")
+        worker.work()
+        without = CliRunner().invoke(cli, words)
+        assert f"{bucket} is not copied: add --bucket" in without.stderr
+        assert not (target / "store").exists()
+
+        copied = CliRunner().invoke(cli, [*words, "--bucket"])
+        assert copied.exit_code == 0, copied.output
+        again = make_backup(in_bucket, target, copies_bucket=True)
+        assert (again.new_artifacts, again.damaged, again.missing) == (0, [], [])
+        assert again.artifacts == len(list(open_store(bucket).stored())) > 0
+        submit(server, (3.0, 4.0), "second")
+        worker.work()
+        third = make_backup(in_bucket, target, copies_bucket=True)
+        assert 0 < third.new_artifacts < third.artifacts
+
+    copy = DirectoryStore(target / "store")
+    assert set(copy.shown()) == set(open_store(bucket).shown())
+    # Versions of the copy are hard links: they need no room.
+    assert all(stored.is_shown for stored in copy.stored() if stored.name in shown(copy))
+    # The account of the bucket is gone.
+    for name in ("AWS_ENDPOINT_URL", "AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.delenv(name, raising=False)
+    restored = tmp_path / "restored"
+    shutil.copytree(target, restored)
+    with served(restored) as server:
+        for name in ("first", "second"):
+            pulled = tmp_path / name
+            result = CliRunner().invoke(cli, ["pull", name, str(pulled), "--url", server.url])
+            assert result.exit_code == 0, result.output
+            assert CliRunner().invoke(cli, ["verify", str(pulled)]).exit_code == 0
+
+
+def test_a_version_that_is_removed_from_a_bucket_is_hidden_in_its_copy(
+    bucket: str, tmp_path: Path
+) -> None:
+    in_bucket = Settings.chosen(data=tmp_path / "data", store=bucket, durable=False)
+    target = tmp_path / "backup"
+    with serving(make_app(in_bucket)) as url:
+        server = RunningServer(url, in_bucket.data)
+        worker = worker_of(server, bucket)
+        submit(server, (1.0, 2.0), "first")
+        worker.work()
+        make_backup(in_bucket, target, copies_bucket=True)
+    copy = DirectoryStore(target / "store")
+    (version,) = copy.versions(MANIFEST_NAME)
+    open_store(bucket).hide(version.dataset, version.version)
+    make_backup(in_bucket, target, copies_bucket=True)
+    assert list(copy.shown()) == []

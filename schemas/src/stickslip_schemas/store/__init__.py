@@ -161,6 +161,9 @@ class Store(Protocol):
     def versions(self, path: str) -> Iterator[ShownVersion]:
         """Yield the versions that show a file at `path`."""
 
+    def shown(self) -> Iterator[tuple[str, int, str]]:
+        """Yield the files that versions show: dataset, version and path."""
+
     def hide(self, dataset: str, version: int) -> None:
         """Let a version show nothing any more; the artifacts stay. Hiding it twice is no error."""
 
@@ -415,6 +418,14 @@ class DirectoryStore:
             # Other directories are not ours.
             if VERSION.fullmatch(version):
                 yield ShownVersion(dataset, int(version[1:]), place.stat().st_mtime)
+
+    def shown(self) -> Iterator[tuple[str, int, str]]:
+        root = self.root / DATASETS
+        for place in sorted(root.glob("*/v*/**/*")):
+            dataset, version, *parts = place.relative_to(root).parts
+            # Other directories are not ours.
+            if VERSION.fullmatch(version) and place.is_file():
+                yield dataset, int(version[1:]), "/".join(parts)
 
     def hide(self, dataset: str, version: int) -> None:
         directory = self.dataset_path(dataset, version)

@@ -207,6 +207,15 @@ class BucketStore:
                     continue
                 yield ShownVersion(dataset, version, head["last_modified"].timestamp())
 
+    def shown(self) -> Iterator[tuple[str, int, str]]:
+        """Yield the files that versions show: dataset, version and path."""
+        for item in self._objects.list_objects(f"{DATASETS}/"):
+            dataset, _, rest = item["path"].removeprefix(f"{DATASETS}/").partition("/")
+            version, _, path = rest.partition("/")
+            # Objects of somebody else may lie below the prefix.
+            if path and VERSION.fullmatch(version):
+                yield dataset, int(version[1:]), path
+
     def hide(self, dataset: str, version: int) -> None:
         """Let a version show nothing any more."""
         copies = self._objects.list_objects(f"{version_name(dataset, version)}/")

@@ -172,22 +172,28 @@ def scrub(settings: Settings, rate: float) -> None:
 @click.argument(
     "target", type=click.Path(path_type=Path, file_okay=False), help="empty, or an earlier backup"
 )
+@click.option("--bucket", "copies_bucket", is_flag=True, help="Download a store in a bucket, too.")
 @keeps
-def backup(settings: Settings, target: Path) -> None:
+def backup(settings: Settings, target: Path, copies_bucket: bool) -> None:
     """Copy database, store and keys to a directory, also while the service runs.
 
     Into an earlier backup, only new files are copied. A backup is a data directory: to restore it,
-    copy it, and start the service with it. The dump of a PostgreSQL database needs pg_restore, and
-    a bucket is not copied. Exit with 1 if a file of the store is damaged, or was deleted meanwhile.
+    copy it, and start the service with it. The dump of a PostgreSQL database needs pg_restore. A
+    bucket is copied with --bucket only: it may be larger than a disk, and downloads cost. Exit
+    with 1 if a file of the store is damaged, or was deleted meanwhile.
     """
     _refuse_none(settings, Role.visitor)
-    copied = make_backup(settings, target)
+    copied = make_backup(settings, target, copies_bucket=copies_bucket)
     tell(
         f"{target} has {copied.artifacts:,} files, {copied.bytes / BYTES_A_MEGABYTE:,.1f} MB, of "
         f"which {copied.new_artifacts:,}, {copied.new_bytes / BYTES_A_MEGABYTE:,.1f} MB, are new"
     )
-    if settings.store is not None and settings.store.startswith("s3://"):
-        say(f"{settings.store} is not copied: turn on versioning of the bucket, or replicate it")
+    is_in_bucket = settings.store is not None and settings.store.startswith("s3://")
+    if is_in_bucket and not copies_bucket:
+        say(
+            f"{settings.store} is not copied: add --bucket, turn on versioning of the bucket, or "
+            "replicate it"
+        )
     for digest in copied.damaged:
         say(f"left out, because it is damaged: {digest}")
     for digest in copied.missing:

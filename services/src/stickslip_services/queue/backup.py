@@ -51,7 +51,7 @@ class BackupRecord(Document):
     database: str
     """Name of the file with the database."""
     store: str
-    """Directory of the copy of the store, or the URL of the bucket, which is not copied."""
+    """Directory of the copy of the store, or the URL of a bucket that was not copied."""
     artifacts: int
     bytes: int
     """Size of the artifacts [bytes]."""
@@ -73,8 +73,10 @@ class Backup:
     """Digests of artifacts that the database needs and that were deleted during the copy."""
 
 
-def make_backup(settings: Settings, target: Path) -> Backup:
+def make_backup(settings: Settings, target: Path, *, copies_bucket: bool = False) -> Backup:
     """Copy database, store and keys to a directory, which may hold an earlier backup.
+
+    A store in a bucket is copied only with `copies_bucket`: it may be larger than a disk.
 
     Raises:
         CommandError: The target holds something else, or the database cannot be copied.
@@ -90,8 +92,8 @@ def make_backup(settings: Settings, target: Path) -> Backup:
     with locked(target):
         store = open_store(settings.store_place)
         made_at = time.time()
-        with _copied_database(settings, target) as (name, needed):
-            backup, copy = _copy_store(store, target)
+        with _copied_database(settings, target, copies_bucket) as (name, needed):
+            backup, copy = _copy_store(store, target, copies_bucket)
             backup.missing = _missing(copy, needed, backup.damaged)
             for key in _KEY_NAMES:
                 with suppress(FileNotFoundError):
@@ -114,7 +116,9 @@ def make_backup(settings: Settings, target: Path) -> Backup:
 
 
 @contextmanager
-def _copied_database(settings: Settings, target: Path) -> Iterator[tuple[str, set[bytes]]]:
+def _copied_database(
+    settings: Settings, target: Path, copies_bucket: bool
+) -> Iterator[tuple[str, set[bytes]]]:
     """Copy the database; yield its name in the backup and the artifacts that it needs.
 
     The copy gets its name after the block.
@@ -128,27 +132,32 @@ def _copied_database(settings: Settings, target: Path) -> Iterator[tuple[str, se
     if is_sqlite:
         _copy_sqlite(settings.database_path, scratch)
         with closing(SqliteDatabase(scratch)) as database:
-            needed = _present(database, store)
+            needed = _present(database, store, copies_bucket)
         yield name, needed
     else:
         # As another coordinator, this process keeps `rm` and `gc` away until it has ended.
         with closing(connect(settings, Role.coordinator)) as database:
             with database.write():
                 pass
-            needed = _present(database, store)
+            needed = _present(database, store, copies_bucket)
             _dump_postgresql(settings, scratch)
             yield name, needed
     scratch.replace(target / name)
 
 
-def _present(database: Database, store: Store) -> set[bytes]:
-    """Return the digests in a database that are artifacts of the store.
+def _present(database: Database, store: Store, copies_bucket: bool) -> set[bytes]:
+    """Return the digests in a database that are artifacts of a store that is copied.
 
     A digest in a task may also be that of something else. `scrub` looks for lost files.
     """
-    if not isinstance(store, DirectoryStore):
+    if isinstance(store, DirectoryStore):
+        needed = needed_artifacts(database, store)
+        return {digest for digest in needed if store.exists(digest.hex())}
+    if not copies_bucket:
         return set()
-    return {digest for digest in needed_artifacts(database, store) if store.exists(digest.hex())}
+    # A bucket is listed in thousands; a question for each artifact would be a request.
+    stored = {bytes.fromhex(file.name) for file in store.stored()}
+    return needed_artifacts(database, store) & stored
 
 
 def _copy_sqlite(path: Path, target: Path) -> None:
@@ -192,15 +201,23 @@ def _dump_postgresql(settings: Settings, target: Path) -> None:
 # ---- Store ---------------------------------------------------------------------------------------
 
 
-def _copy_store(store: Store, target: Path) -> tuple[Backup, Store]:
-    """Copy a store in a directory; return what was copied, and the copy.
+def _copy_store(store: Store, target: Path, copies_bucket: bool) -> tuple[Backup, Store]:
+    """Copy a store; return what was copied, and the copy.
 
-    A bucket is not copied, and is returned itself.
+    A bucket that is not copied is returned itself.
     """
     backup = Backup()
-    if not isinstance(store, DirectoryStore):
-        return backup, store
     copy = DirectoryStore(target / "store")
+    if isinstance(store, DirectoryStore):
+        _copy_directory(store, copy, backup)
+    elif copies_bucket:
+        _copy_bucket(store, copy, backup)
+    else:
+        return backup, store
+    return backup, copy
+
+
+def _copy_directory(store: DirectoryStore, copy: DirectoryStore, backup: Backup) -> None:
     # Versions show artifacts by hard links, which have the inode of the artifact.
     digests: dict[int, str] = {}
     for file in store.stored():
@@ -209,11 +226,30 @@ def _copy_store(store: Store, target: Path) -> tuple[Backup, Store]:
                 digests[store.path(file.name).stat().st_ino] = file.name
                 _copy_artifact(store, copy, file.name, file.bytes, backup)
     _copy_versions(store, copy, digests)
-    return backup, copy
+
+
+def _copy_bucket(store: Store, copy: DirectoryStore, backup: Backup) -> None:
+    """Download the artifacts and the files of versions that the copy lacks."""
+    # What is shown was an artifact before, so the list of artifacts, which is made later, has it.
+    shown = set(store.shown())
+    for file in store.stored():
+        with suppress(FileNotFoundError):
+            _copy_artifact(store, copy, file.name, file.bytes, backup)
+    for dataset, version in {(dataset, version) for dataset, version, _ in copy.shown()}:
+        if not any(name[:2] == (dataset, version) for name in shown):
+            copy.hide(dataset, version)
+    # The files of a version never change, so those that the copy shows are not read again.
+    for dataset, version, path in sorted(shown - set(copy.shown())):
+        with suppress(FileNotFoundError):
+            digest = sha256(store.read_shown(dataset, version, path))
+            if copy.exists(digest):
+                copy.show(digest, dataset, version, path)
+            else:
+                backup.damaged.append(digest)
 
 
 def _copy_artifact(
-    store: DirectoryStore, copy: DirectoryStore, digest: str, size: int, backup: Backup
+    store: Store, copy: DirectoryStore, digest: str, size: int, backup: Backup
 ) -> None:
     if not copy.exists(digest) or copy.size(digest) != size:
         try:
