@@ -172,25 +172,25 @@ def changes(record: Row, coarse: float, fine: float) -> dict[str, float]:
 
     Fabrics that were not draped with both have none.
     """
-    found: dict[str, float] = {}
+    differences: dict[str, float] = {}
     for name in fabric_names():
         means = [of_fabric(record, name, cell, "drape_percent") for cell in (coarse, fine)]
         if all(means):
-            found[name] = fmean(means[1]) - fmean(means[0])
-    return found
+            differences[name] = fmean(means[1]) - fmean(means[0])
+    return differences
 
 
 def change_words(record: Row, coarse: float, fine: float) -> str:
     """Return a sentence on the change of the coefficients between two meshes."""
-    found = changes(record, coarse, fine)
-    if not found:
+    differences = changes(record, coarse, fine)
+    if not differences:
         return f"No fabric was draped with both {coarse:g} and {fine:g} mm."
-    worst = max(found, key=lambda name: abs(found[name]))
-    within = sum(abs(value) <= 2.0 for value in found.values())
+    worst = max(differences, key=lambda name: abs(differences[name]))
+    within = sum(abs(value) <= 2.0 for value in differences.values())
     return (
         f"From {coarse:g} to {fine:g} mm the mean changes by at most 2 points for {within} of the "
-        f"{len(found)} fabrics that were draped with both, and by {found[worst]:+.1f} points at "
-        f"most (`{worst}`)."
+        f"{len(differences)} fabrics that were draped with both, and by {differences[worst]:+.1f} "
+        f"points at most (`{worst}`)."
     )
 
 

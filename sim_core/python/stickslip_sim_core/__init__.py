@@ -26,6 +26,7 @@ from stickslip_sim_core.rods.fit import (
 from stickslip_sim_core.rods.inverse import NaturalCurvature, natural_curvature
 from stickslip_sim_core.rods.labels import OtherMinima, other_minima, reach, self_contact_distance
 from stickslip_sim_core.rods.solve import RodSolution, solve_general_rods, solve_rods
+from stickslip_sim_core.rods.tilt import TiltedFit, fit_tilted_clamp
 from stickslip_sim_core.scenes.scene import ClothRun, Scene
 
 __all__ = [
@@ -45,6 +46,7 @@ __all__ = [
     "SelfContact",
     "SolverSettings",
     "Surface",
+    "TiltedFit",
     "box",
     "capsule",
     "build_info",
@@ -53,6 +55,7 @@ __all__ = [
     "fabric_names",
     "fit_natural_curvature",
     "fit_parameters",
+    "fit_tilted_clamp",
     "isotropic",
     "natural_curvature",
     "other_minima",
