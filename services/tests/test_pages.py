@@ -206,7 +206,7 @@ def test_samples_of_two_datasets_are_compared(client: httpx.Client, worker: Pret
     assert f'<option value="{places["first"]}"' not in alone
 
     both = html.unescape(read(client, f"{page}?beside=0&of={places['second']}"))
-    assert "Sample 1 and sample 0 of second, version 1" in both
+    assert "Sample 1 of first, version 1 and sample 0 of second, version 1" in both
     assert f'<option value="{places["second"]}" selected>' in both
     for title in ("sample 1 of first, version 1", "sample 0 of second, version 1"):
         assert f'"{title}: ' in both

@@ -270,3 +270,5 @@ def test_samples_of_two_datasets_share_time_layers_curves_and_differences() -> N
     # What only one of them has is a plot of its own.
     names = {of_sample["name"] for view in views for of_sample in view["plots"]}
     assert {joined["name"] for joined in overlaid(views)} == names
+    forces = next(joined for joined in overlaid(views) if joined["name"] == "contact_force")
+    assert "; sample 0 of cloth: contact_force: " in forces["y"]

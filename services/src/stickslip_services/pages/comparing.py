@@ -61,10 +61,14 @@ def overlaid(views: Sequence[View]) -> list[dict[str, Any]]:
         for of_sample in view["plots"]:
             key = (of_sample["name"], of_sample["x"])
             tables = [_named(part, view["title"], position) for part in of_sample["tables"]]
-            if key in joined:
-                joined[key]["tables"] += tables
-            else:
+            if key not in joined:
                 joined[key] = {**of_sample, "tables": tables}
+                continue
+            shown = joined[key]
+            shown["tables"] += tables
+            if of_sample["y"] != shown["y"]:
+                # Two kinds may describe one array differently.
+                shown["y"] += f"; {view['title']}: {of_sample['y']}"
     return list(joined.values())
 
 
