@@ -40,6 +40,12 @@ class Simulator:
 
 
 @pytest.fixture
+def falling_text() -> str:
+    """The adapter of a patch that falls."""
+    return FALLING.replace("STEP", "pass").replace("START", "pass")
+
+
+@pytest.fixture
 def written(tmp_path: Path) -> Callable[[str], Program]:
     """Write an adapter into a file, and return how to run it."""
 

@@ -61,6 +61,7 @@ def test_drag_is_no_lie_about_time(falling: Adapter, tmp_path: Path) -> None:
     assert findings(cells)[0].fault == "something brakes a free fall"
 
 
+@pytest.mark.physics
 def test_a_campaign_goes_on_where_it_stopped(falling: Adapter, tmp_path: Path) -> None:
     program = falling(step=f"{LATE} raise ValueError('lost')")
     measured(program, tmp_path, "creep")
@@ -74,6 +75,21 @@ def test_a_campaign_goes_on_where_it_stopped(falling: Adapter, tmp_path: Path) -
     assert second > first
     measured(falling(step=f"{LATE} raise ValueError('gone')"), tmp_path, "creep")
     assert read_cell(path).reason == "ValueError: gone"
+
+
+def test_another_version_of_the_simulator_is_measured_anew(
+    written: Callable[[str], Program], falling_text: str, tmp_path: Path
+) -> None:
+    """The adapter asks its simulator for the version, so its own text does not change."""
+    text = f"from pathlib import Path\n{falling_text}".replace(
+        'version = "1"', "version = Path(__file__).with_name('version').read_text()"
+    )
+    versions = []
+    for version in ("1.0", "1.1"):
+        (tmp_path / "version").write_text(version)
+        measured(written(text), tmp_path)
+        versions.append(read_cell(tmp_path / "falling" / "default" / "fall-4.json").version)
+    assert versions == ["1.0", "1.1"]
 
 
 def test_the_page_says_who_holds_and_why_a_cell_has_no_value(

@@ -1,5 +1,6 @@
 """An adapter runs in a process of its own. What goes wrong in it has a name and a reason."""
 
+import ast
 import sys
 import time
 from collections.abc import Callable
@@ -135,6 +136,14 @@ def test_files_of_the_package_hide_no_module_of_the_simulator(
     program = falling(start="import host; assert host.WHOSE == 'the simulator'")
     fall(program, tmp_path / "log")
     assert describe(program, tmp_path / "log", 30.0).python == sys.version.split()[0]
+
+
+@pytest.mark.parametrize("name", ["contract.py", "host.py", "wire.py"])
+def test_what_runs_beside_a_simulator_is_python_3_9(name: str) -> None:
+    path = Path(adapters.__file__).parents[1] / name
+    tree = ast.parse(path.read_text(), feature_version=(3, 9))
+    # Annotations stay text, so those of newer Pythons do no harm.
+    assert "annotations" in ast.unparse(tree.body[1])
 
 
 def test_the_core_by_its_adapter_gives_the_slope_of_the_protocol(tmp_path: Path) -> None:

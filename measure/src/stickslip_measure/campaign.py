@@ -143,7 +143,7 @@ def _experiment(
     experiment: Experiment,
     softer: float,
 ) -> Iterator[Cell]:
-    key = _key(request.program, setting, softer)
+    key = _key(request.program, description, setting, softer)
     for cells in experiment.cells:
         path = _path(request, description, row, experiment, cells)
         if path.exists():
@@ -197,14 +197,14 @@ def _path(
     return request.out / description.name / row / f"{experiment.name}-{cells}.json"
 
 
-def _key(program: Program, setting: str, softer: float) -> str:
-    """Return a digest of all that decides a cell, apart from the simulator's own files."""
+def _key(program: Program, description: Description, setting: str, softer: float) -> str:
+    """Return a digest of all that decides a cell: of the simulator itself, its version."""
     digest = hashlib.sha256()
     # A changed experiment changes the meaning of its value.
     sources = sorted(Path(__file__).parent.glob("experiments/*.py"))
     for path in (program.adapter, Path(__file__).with_name("laboratory.py"), *sources):
         digest.update(path.read_bytes())
-    digest.update(f"{program.python} {setting} {softer!r}".encode())
+    digest.update(f"{program.python} {description.version} {setting} {softer!r}".encode())
     return digest.hexdigest()
 
 
