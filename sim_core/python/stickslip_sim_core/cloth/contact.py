@@ -372,11 +372,13 @@ class Surface:
             ValueError: The positions are not (N, 3) or not finite.
         """
         # A user's function may return lists, or other numbers at some times: check every time.
-        found = np.ascontiguousarray(
+        positions = np.ascontiguousarray(
             self.positions(time) if callable(self.positions) else self.positions, dtype=float
         )
-        if found.ndim != 2 or found.shape[1] != 3:
-            raise ValueError(f"positions: must be (N, 3), got shape {found.shape} at {time:g} s")
-        if not np.isfinite(found).all():
+        if positions.ndim != 2 or positions.shape[1] != 3:
+            raise ValueError(
+                f"positions: must be (N, 3), got shape {positions.shape} at {time:g} s"
+            )
+        if not np.isfinite(positions).all():
             raise ValueError(f"positions: must be finite, and are not at {time:g} s")
-        return found
+        return positions

@@ -226,7 +226,7 @@ class _Gravity:
 
     def __init__(self, document: Document, sheets: Sequence[Sheet], seed: int) -> None:
         self._down = np.tile(
-            np.array(document["gravity"], float), (sum(len(one.start) for one in sheets), 1)
+            np.array(document["gravity"], float), (sum(len(sheet.start) for sheet in sheets), 1)
         )
         self._size = float(np.linalg.norm(document["gravity"]))
         self._tilted = self._down
@@ -269,20 +269,21 @@ class _Forces:
     def __init__(
         self, sheets: Sequence[Sheet], things: Sequence[Thing], holders: Sequence[Any]
     ) -> None:
-        self._names = [one.name for one in sheets]
+        self._names = [sheet.name for sheet in sheets]
         self._sheets, self._things, self._holders = len(sheets), len(things), holders
-        rigid = [number for number, one in enumerate(things) if one.rigid is not None]
-        surfaces = [number for number, one in enumerate(things) if one.surface is not None]
+        rigid = [number for number, thing in enumerate(things) if thing.rigid is not None]
+        surfaces = [number for number, thing in enumerate(things) if thing.surface is not None]
         # The solver counts surfaces after rigid bodies, and a scene has both in order of names.
-        self._others = np.array([*rigid, *surfaces], dtype=np.intp)
+        self._partners = np.array([*rigid, *surfaces], dtype=np.intp)
         # The owner of a vertex is a number along the axis of `force`: bodies first, then sheets.
         # The solver's vertices are those of all sheets, and then those of all surfaces.
-        sizes = [len(one.surface.at(0.0)) for one in things if one.surface is not None]
+        sizes = [len(thing.surface.at(0.0)) for thing in things if thing.surface is not None]
         owners = [
-            self._things + np.repeat(np.arange(self._sheets), [len(one.start) for one in sheets])
+            self._things
+            + np.repeat(np.arange(self._sheets), [len(sheet.start) for sheet in sheets])
         ]
         self._owner = np.concatenate([*owners, np.repeat(np.array(surfaces, dtype=np.intp), sizes)])
-        self._ends = np.cumsum([len(one.start) for one in sheets])
+        self._ends = np.cumsum([len(sheet.start) for sheet in sheets])
 
     def __call__(self, cloth: Cloth) -> Record:
         """Return `contact_force`, `SHEET.contact` and `holder_force`.
@@ -308,12 +309,12 @@ class _Forces:
             # Several vertices add to the same entry, which `force[...] +=` would count once.
             np.add.at(
                 force,
-                (self._owner[touching], self._others[contacts[touching]]),
+                (self._owner[touching], self._partners[contacts[touching]]),
                 reactions[touching] - across[touching],
             )
             np.add.at(
                 force,
-                (self._owner[pressed], self._others[opposites[pressed]]),
+                (self._owner[pressed], self._partners[opposites[pressed]]),
                 across[pressed],
             )
             state[touching] = np.where(cloth.sliding[touching], 2, 1)
@@ -324,9 +325,11 @@ class _Forces:
             last = owner[:, 3]
             nearest = _nearest(pairs.weights)
             for corner in range(4):
-                own = owner[:, corner]
+                owner_of_corner = owner[:, corner]
                 pull = pairs.weights[:, corner, None] * pairs.forces
-                np.add.at(force, (own, np.where(own == first, last, first)), pull)
+                np.add.at(
+                    force, (owner_of_corner, np.where(owner_of_corner == first, last, first)), pull
+                )
                 # Only vertices of cloth have a state. Slip (2) in one pair outweighs sticking (1)
                 # in another.
                 here = (pairs.vertices[:, corner] < vertices) & nearest[:, corner]
@@ -339,12 +342,12 @@ class _Forces:
             for number, holder in enumerate(self._holders):
                 if held[holder.vertices].all():
                     pulls[number] = reactions[holder.vertices].sum(axis=0)
-        found = {"contact_force": force[self._things :]}
-        found |= {
-            f"{name}.contact": own
-            for name, own in zip(self._names, np.split(state, self._ends[:-1]), strict=True)
+        arrays = {"contact_force": force[self._things :]}
+        arrays |= {
+            f"{name}.contact": states
+            for name, states in zip(self._names, np.split(state, self._ends[:-1]), strict=True)
         }
-        return found | ({"holder_force": pulls} if len(self._holders) else {})
+        return arrays | ({"holder_force": pulls} if len(self._holders) else {})
 
 
 def _nearest(weights: Floats) -> NDArray[np.bool_]:
@@ -376,16 +379,16 @@ def _arrays(run: ClothRun, sheets: Sequence[Sheet], things: Sequence[Thing]) -> 
 def _labels(
     run: ClothRun, document: Document, sheets: Sequence[Sheet], bias: Floats
 ) -> dict[str, Any]:
-    found: dict[str, Any] = {"least_distance": float(run.least_distance)}
-    for one in sheets:
-        found |= fabric_labels(one.fabric, f"{one.name}.")
-        if one.hung is not None:
-            found[f"{one.name}.tilt"] = one.hung.side * one.hung.bias
+    labels: dict[str, Any] = {"least_distance": float(run.least_distance)}
+    for cloth_sheet in sheets:
+        labels |= fabric_labels(cloth_sheet.fabric, f"{cloth_sheet.name}.")
+        if cloth_sheet.hung is not None:
+            labels[f"{cloth_sheet.name}.tilt"] = cloth_sheet.hung.side * cloth_sheet.hung.bias
     if document["bias"] is not None:
-        found["bias"] = bias.tolist()
+        labels["bias"] = bias.tolist()
     if document["end"] is not None:
-        found["rest_time"] = run.rest_time
-    return found
+        labels["rest_time"] = run.rest_time
+    return labels
 
 
 def _simulated(scene_and_seed: Mapping[str, Any], on_frame: OnFrame | None) -> Outcome:
@@ -395,14 +398,14 @@ def _simulated(scene_and_seed: Mapping[str, Any], on_frame: OnFrame | None) -> O
     error is a bug, and the caller gets it.
     """
     try:
-        made = scene(scene_and_seed["scene"], seed=scene_and_seed["seed"])
+        simulated_scene = scene(scene_and_seed["scene"], seed=scene_and_seed["seed"])
     except ValueError as error:
         return Outcome(reason=str(error), code=IMPOSSIBLE_START)
-    return made.outcome(on_frame)
+    return simulated_scene.outcome(on_frame)
 
 
 KIND = Kind(
-    lambda simulations, on_frame: [_simulated(one, on_frame) for one in simulations],
+    lambda simulations, on_frame: [_simulated(simulation, on_frame) for simulation in simulations],
     "stickslip_sim_core.cloth",
     kernel=cloth_kernel,
 )

@@ -66,25 +66,25 @@ class Hands:
         self.events = sorted({t for holder in holders for t in holder.grasp if 0.0 < t < np.inf})
         """Times of all grasps and releases after 0 s [s], ascending."""
         # By the number of a holder: places of its vertices in the axes of the holder, (K, 3) [m].
-        self._taken: dict[int, Floats] = {}
+        self._points_by_holder: dict[int, Floats] = {}
         self.take(0.0, positions)
 
     def take(self, time: float, positions: Floats) -> NDArray[np.int32]:
         """Grasp and release the vertices due at this time [s], and return the held ones (K,)."""
-        taken: dict[int, Floats] = {}
+        points_by_holder: dict[int, Floats] = {}
         for number, holder in enumerate(self.holders):
             if holder.holds(time):
                 pose = holder.pose(time)
                 place = (positions[holder.vertices] - pose[:, 3]) @ pose[:, :3]
                 # A holder keeps the places from its grasp: new ones at each event would drift.
-                taken[number] = self._taken.get(number, place)
-        self._taken = taken
+                points_by_holder[number] = self._points_by_holder.get(number, place)
+        self._points_by_holder = points_by_holder
         return self.vertices
 
     @property
     def vertices(self) -> NDArray[np.int32]:
         """Held vertices, holder by holder: (K,)."""
-        held = [self.holders[number].vertices for number in self._taken]
+        held = [self.holders[number].vertices for number in self._points_by_holder]
         return np.concatenate([np.empty(0, np.int32), *held], dtype=np.int32)
 
     def at(self, time: ArrayLike) -> Floats:
@@ -94,12 +94,14 @@ class Hands:
         """
         # Empty arrays keep the shape if no holder holds a vertex.
         shape = np.shape(time)
-        found = [np.empty((*shape, 0, 3))]
-        for number, points in self._taken.items():
+        placed_points = [np.empty((*shape, 0, 3))]
+        for number, points in self._points_by_holder.items():
             # A holder at rest may return one pose for all times.
             pose = np.broadcast_to(self.holders[number].pose(time), (*shape, 3, 4))
-            found.append(points @ np.swapaxes(pose[..., :3], -1, -2) + pose[..., None, :, 3])
-        return np.concatenate(found, axis=-2)
+            placed_points.append(
+                points @ np.swapaxes(pose[..., :3], -1, -2) + pose[..., None, :, 3]
+            )
+        return np.concatenate(placed_points, axis=-2)
 
     def driving(self, motion: Callable[[float], tuple[Floats, Sequence[Body]]]) -> Motion:
         """Add the positions of held vertices to a motion, which returns gravity and bodies."""

@@ -111,11 +111,11 @@ class Keyframes:
 
     def pose(self, time: ArrayLike) -> Floats:
         """Return the motion x -> R x + b at a time [s], or at times (T,): ([T,] 3, 4) [m]."""
-        found = self._path(time)
-        R = rotation(found[..., 3:])
+        pose = self._path(time)
+        R = rotation(pose[..., 3:])
         # R (x - about) + about + move, as a matrix and a shift.
         about = np.asarray(self.about)
-        return np.concatenate([R, (about + found[..., :3] - R @ about)[..., None]], axis=-1)
+        return np.concatenate([R, (about + pose[..., :3] - R @ about)[..., None]], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,12 +199,12 @@ def rotation(turn: ArrayLike) -> Floats:
 
     # scipy takes a single list of rotation vectors.
     vectors = np.asarray(turn, float)
-    found = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(*vectors.shape, 3)
+    matrices = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(*vectors.shape, 3)
     # A matrix with one oblique entry stays as it is: rounding a part of it would leave no rotation.
     # Adding 0.0 turns -0.0 into 0.0.
-    whole = np.rint(found)
-    oblique = (np.abs(found - whole) > RIGHT_ANGLE).any(axis=(-2, -1), keepdims=True)
-    return np.where(oblique, found, whole + 0.0)
+    whole = np.rint(matrices)
+    oblique = (np.abs(matrices - whole) > RIGHT_ANGLE).any(axis=(-2, -1), keepdims=True)
+    return np.where(oblique, matrices, whole + 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -305,9 +305,9 @@ class MovingMesh:
             return path
         # Bone by bone: all products at once would need memory for every vertex and bone.
         x, y, z = np.asarray(self.rest, float).T[..., None]
-        found = np.zeros((len(x), 3))
+        vertices = np.zeros((len(x), 3))
         for weight, bone in zip(np.asarray(self.weights, float).T, path, strict=True):
-            found += weight[:, None] * (
+            vertices += weight[:, None] * (
                 x * bone[:, 0] + y * bone[:, 1] + z * bone[:, 2] + bone[:, 3]
             )
-        return found
+        return vertices

@@ -64,7 +64,7 @@ class Sheet:
 
 def sheet(
     name: str,
-    given: Document,
+    document: Document,
     materials: Document,
     *,
     gravity: ArrayLike,
@@ -79,15 +79,17 @@ def sheet(
         ValueError: A value breaks its rule. The message begins with the place of the value.
     """
     place = f"sheets.{name}"
-    mesh, positions = _mesh(given["mesh"])
-    custom = materials.get(given["material"])
-    made = (
-        fabric(given["material"]) if custom is None else custom_fabric(given["material"], **custom)
+    mesh, positions = _mesh(document["mesh"])
+    custom = materials.get(document["material"])
+    cloth_fabric = (
+        fabric(document["material"])
+        if custom is None
+        else custom_fabric(document["material"], **custom)
     )
-    made = made.scaled(**given["factors"])
-    turn = rotation(given["turn"])
-    origin = np.array(given["origin"], float)
-    begin = given["start"]
+    cloth_fabric = cloth_fabric.scaled(**document["factors"])
+    turn = rotation(document["turn"])
+    origin = np.array(document["origin"], float)
+    begin = document["start"]
     # The flat sheet in its own axes, before the document turns and moves it.
     local = np.column_stack([mesh.rest, np.zeros(len(mesh.rest))])
     if begin["type"] == "stretched":
@@ -106,13 +108,13 @@ def sheet(
     tracks: dict[str, Callable[[ArrayLike], Floats]] = {}
     boxes: dict[str, Floats] = {}
     last = 0.0
-    taken = np.zeros(len(start), dtype=bool)
+    held_before = np.zeros(len(start), dtype=bool)
     # In the order of names, so that results do not depend on the order in the document.
-    for key, holder in sorted(given["holders"].items()):
+    for key, holder in sorted(document["holders"].items()):
         held = _held(mesh, holder, f"{place}.holders.{key}")
-        if (held & taken).any():
+        if (held & held_before).any():
             raise ValueError(f"{place}.holders.{key}: must not hold what another holder holds")
-        taken |= held
+        held_before |= held
         # A holder turns about the middle of its vertices, unless the document names a point.
         middle = start[held].mean(axis=0)
         motion = rigid_motion(holder["motion"], middle)
@@ -128,27 +130,38 @@ def sheet(
     if begin["type"] == "hung":
         hanging = hung(
             mesh,
-            made,
+            cloth_fabric,
             start,
-            np.flatnonzero(taken),
+            np.flatnonzero(held_before),
             normal=turn[:, 2],
             seed=seed,
             gravity=gravity,
             kernel=kernel,
         )
         start = hanging.positions
-    return Sheet(name, mesh, made, given["thickness"], start, hanging, holders, tracks, boxes, last)
+    return Sheet(
+        name,
+        mesh,
+        cloth_fabric,
+        document["thickness"],
+        start,
+        hanging,
+        holders,
+        tracks,
+        boxes,
+        last,
+    )
 
 
-def _mesh(given: Document) -> tuple[meshes.Mesh, Floats | None]:
+def _mesh(document: Document) -> tuple[meshes.Mesh, Floats | None]:
     """Return the mesh of a sheet, and its positions if a file has them."""
-    if given["type"] == "grid":
-        return meshes.grid(*given["size"], *given["cells"]), None
-    if given["type"] == "unstructured":
+    if document["type"] == "grid":
+        return meshes.grid(*document["size"], *document["cells"]), None
+    if document["type"] == "unstructured":
         return meshes.unstructured(
-            given["size"][0], given["size"][1], given["spacing"], given["seed"]
+            document["size"][0], document["size"][1], document["spacing"], document["seed"]
         ), None
-    file = given["file"]
+    file = document["file"]
     return meshes.Mesh(file["rest"], np.asarray(file["triangles"], np.int32)), file["positions"]
 
 
@@ -185,26 +198,31 @@ def _held(mesh: meshes.Mesh, holder: Document, place: str) -> NDArray[np.bool_]:
     return held
 
 
-def rigid_motion(given: Document | None, middle: Floats) -> RigidMotion:
+def rigid_motion(document: Document | None, middle: Floats) -> RigidMotion:
     """Return a motion of a document.
 
     Turns are about `middle` (3,) [m] if the document names no point.
     """
     # A part without a motion stays in place.
-    if given is None:
+    if document is None:
         return Keyframes([0.0], np.zeros((1, 3)), np.zeros((1, 3)))
-    about = middle if given["about"] is None else np.array(given["about"], float)
-    if given["spin"] is not None:
-        spin = given["spin"]
+    about = middle if document["about"] is None else np.array(document["about"], float)
+    if document["spin"] is not None:
+        spin = document["spin"]
         return Spin(spin["axis"], spin["speed"], spin["begin"], spin["ramp"], about)
-    if given["path"] is not None:
-        times, moves, turns = (given["path"][name] for name in ("time", "move", "turn"))
+    if document["path"] is not None:
+        times, moves, turns = (document["path"][name] for name in ("time", "move", "turn"))
     else:
         times, moves, turns = (
-            np.array([key[name] for key in given["keys"]]) for name in ("time", "move", "turn")
+            np.array([key[name] for key in document["keys"]]) for name in ("time", "move", "turn")
         )
     return Keyframes(
-        times, moves, turns, about, linear=given["interpolation"] == "linear", ramp=given["ramp"]
+        times,
+        moves,
+        turns,
+        about,
+        linear=document["interpolation"] == "linear",
+        ramp=document["ramp"],
     )
 
 
@@ -242,7 +260,7 @@ class Thing:
     """Whether the vertices of a surface move relative to its axes."""
 
 
-def thing(name: str, given: Document, mu: Sequence[float], *, cell: float) -> Thing:
+def thing(name: str, document: Document, mu: Sequence[float], *, cell: float) -> Thing:
     """Return a body of a document.
 
     `mu` has its coefficients of friction with each sheet. `cell` is the largest side of a cell of a
@@ -251,59 +269,59 @@ def thing(name: str, given: Document, mu: Sequence[float], *, cell: float) -> Th
     Raises:
         ValueError: A value breaks its rule. The message begins with the place of the value.
     """
-    if given["type"] == "plane":
-        still = plane(mu, normal=given["normal"], origin=given["origin"])
+    if document["type"] == "plane":
+        still = plane(mu, normal=document["normal"], origin=document["origin"])
         return Thing(
             name,
             lambda time: np.broadcast_to(still.pose, (*np.shape(time), 3, 4)),
             0.0,
             lambda _time: still,
         )
-    if given["type"] == "mesh":
-        return _surface(name, given, mu)
-    origin = np.array(given["origin"], float)
-    motion = rigid_motion(given["motion"], origin)
-    pose = _carried(motion, rotation(given["turn"]), origin)
+    if document["type"] == "mesh":
+        return _surface(name, document, mu)
+    origin = np.array(document["origin"], float)
+    motion = rigid_motion(document["motion"], origin)
+    pose = _carried(motion, rotation(document["turn"]), origin)
 
-    rounding = given.get("rounding")
-    if given["type"] == "box" and rounding is None:
-        rounding = default_rounding(given["size"], cell)
+    rounding = document.get("rounding")
+    if document["type"] == "box" and rounding is None:
+        rounding = default_rounding(document["size"], cell)
 
     # Only the pose changes with time, so each shape takes it when the solver needs the body.
-    made: Callable[..., Body] = {
-        "sphere": lambda **placed: sphere(mu, given["radius"], **placed),
-        "cylinder": lambda **placed: cylinder(mu, given["radius"], **placed),
-        "capsule": lambda **placed: capsule(mu, given["radius"], given["length"], **placed),
-        "box": lambda **placed: box(mu, given["size"], rounding=rounding, **placed),
-    }[given["type"]]
+    make_body: Callable[..., Body] = {
+        "sphere": lambda **placed: sphere(mu, document["radius"], **placed),
+        "cylinder": lambda **placed: cylinder(mu, document["radius"], **placed),
+        "capsule": lambda **placed: capsule(mu, document["radius"], document["length"], **placed),
+        "box": lambda **placed: box(mu, document["size"], rounding=rounding, **placed),
+    }[document["type"]]
 
     def rigid(time: float) -> Body:
         now = pose(time)
-        return made(origin=now[:, 3], rotation=now[:, :3])
+        return make_body(origin=now[:, 3], rotation=now[:, :3])
 
     return Thing(name, pose, motion.last, rigid=rigid)
 
 
-def _surface(name: str, given: Document, mu: Sequence[float]) -> Thing:
+def _surface(name: str, document: Document, mu: Sequence[float]) -> Thing:
     # Errors of the mesh and of the surface do not have the name of the body, so add it.
     try:
-        file = given["file"]
+        file = document["file"]
         # A file has the vertices of every frame, or the bones and weights of a skin.
         skin = {name: file[name] for name in ("rest", "weights") if name in file}
         frames = file["bones" if skin else "positions"]
         mesh = MovingMesh(
-            file["triangles"], file["times"], frames, **skin, strength=given["strength"]
+            file["triangles"], file["times"], frames, **skin, strength=document["strength"]
         )
-        motion = rigid_motion(given["motion"], mesh.at(0.0).mean(axis=0))
+        motion = rigid_motion(document["motion"], mesh.at(0.0).mean(axis=0))
 
         # The motion of the document adds to the motion of the file.
         def at(time: float) -> Floats:
-            if given["motion"] is None:
+            if document["motion"] is None:
                 return mesh.at(time)
             pose = motion.pose(time)
             return np.asarray(mesh.at(time) @ pose[:, :3].T + pose[:, 3])
 
-        surface = Surface(mesh.triangles, at, list(mu), given["thickness"])
+        surface = Surface(mesh.triangles, at, list(mu), document["thickness"])
     except ValueError as error:
         raise ValueError(f"bodies.{name}: {error}") from error
     last = max(motion.last, mesh.last)

@@ -48,12 +48,12 @@ def _solved(rods: Sequence[Mapping[str, Any]]) -> Iterable[Outcome]:
     row = np.cumsum(good) - 1
     for i in range(len(rods)):
         if not good[i]:
-            found = (
+            reason = (
                 "no stable equilibrium was found"
                 if solution.converged[i]
                 else "the solver did not converge"
             )
-            yield Outcome(reason=found)
+            yield Outcome(reason=reason)
             continue
         record = {name: getattr(solution, name)[i].astype(np.float32) for name in CURVES}
         record["multistable"] = other.multistable[i]
