@@ -147,7 +147,7 @@ def test_a_second_backup_copies_only_what_is_new(settings: Settings, tmp_path: P
     versions = list(copy.versions(MANIFEST_NAME))
     assert len(versions) == 2
     # Versions of the copy are hard links, too: they need no room.
-    assert all(stored.is_shown for stored in copy.stored() if stored.name in shown(copy))
+    assert all(stored.is_shown for stored in copy.stored() if stored.name in version_files(copy))
     gone = versions[0]
     removed = CliRunner().invoke(
         cli, ["rm", f"{gone.dataset}:v{gone.version}", "--data", str(settings.data)]
@@ -157,7 +157,7 @@ def test_a_second_backup_copies_only_what_is_new(settings: Settings, tmp_path: P
     assert [version.dataset for version in copy.versions(MANIFEST_NAME)] == [versions[1].dataset]
 
 
-def shown(store: DirectoryStore) -> set[str]:
+def version_files(store: DirectoryStore) -> set[str]:
     """Return the digests of the files that versions show."""
     inodes = {path.stat().st_ino for path in (store.root / "datasets").rglob("*") if path.is_file()}
     return {
@@ -269,9 +269,9 @@ def test_a_bucket_is_copied_where_that_is_asked_for(
         assert 0 < third.new_artifacts < third.artifacts
 
     copy = DirectoryStore(target / "store")
-    assert set(copy.shown()) == set(open_store(bucket).shown())
+    assert set(copy.version_files()) == set(open_store(bucket).version_files())
     # Versions of the copy are hard links: they need no room.
-    assert all(stored.is_shown for stored in copy.stored() if stored.name in shown(copy))
+    assert all(stored.is_shown for stored in copy.stored() if stored.name in version_files(copy))
     # The account of the bucket is gone.
     for name in ("AWS_ENDPOINT_URL", "AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
         monkeypatch.delenv(name, raising=False)
@@ -300,4 +300,4 @@ def test_a_version_that_is_removed_from_a_bucket_is_hidden_in_its_copy(
     (version,) = copy.versions(MANIFEST_NAME)
     open_store(bucket).hide(version.dataset, version.version)
     make_backup(in_bucket, target, copies_bucket=True)
-    assert list(copy.shown()) == []
+    assert list(copy.version_files()) == []

@@ -161,7 +161,7 @@ class Store(Protocol):
     def versions(self, path: str) -> Iterator[ShownVersion]:
         """Yield the versions that show a file at `path`."""
 
-    def shown(self) -> Iterator[tuple[str, int, str]]:
+    def version_files(self) -> Iterator[tuple[str, int, str]]:
         """Yield the files that versions show: dataset, version and path."""
 
     def hide(self, dataset: str, version: int) -> None:
@@ -419,7 +419,7 @@ class DirectoryStore:
             if VERSION.fullmatch(version):
                 yield ShownVersion(dataset, int(version[1:]), place.stat().st_mtime)
 
-    def shown(self) -> Iterator[tuple[str, int, str]]:
+    def version_files(self) -> Iterator[tuple[str, int, str]]:
         root = self.root / DATASETS
         for place in sorted(root.glob("*/v*/**/*")):
             dataset, version, *parts = place.relative_to(root).parts

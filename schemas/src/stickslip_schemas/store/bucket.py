@@ -207,7 +207,7 @@ class BucketStore:
                     continue
                 yield ShownVersion(dataset, version, head["last_modified"].timestamp())
 
-    def shown(self) -> Iterator[tuple[str, int, str]]:
+    def version_files(self) -> Iterator[tuple[str, int, str]]:
         """Yield the files that versions show: dataset, version and path."""
         for item in self._objects.list_objects(f"{DATASETS}/"):
             dataset, _, rest = item["path"].removeprefix(f"{DATASETS}/").partition("/")

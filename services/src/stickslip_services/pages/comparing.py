@@ -86,9 +86,9 @@ def label_rows(views: Sequence[View]) -> dict[str, list[LabelRow]]:
         # In the order of the first sample, then what only the second one has.
         names = dict.fromkeys(name for of_sample in labels for name in of_sample)
         rows = [_row(name, labels) for name in names]
-        shown = [row for row in rows if len(views) == 1 or len(set(map(str, row.values))) > 1]
-        if shown:
-            groups[title] = shown
+        differences = [row for row in rows if len(views) == 1 or len(set(map(str, row.values))) > 1]
+        if differences:
+            groups[title] = differences
     return groups
 
 

@@ -157,13 +157,13 @@ def _plot(data: SampleData, name: str, slot: int) -> dict[str, Any]:
         x_name = "time [s]"
     curve_names = _curve_names(array, values.shape[1])
     curves = dict(zip(curve_names, values.T.tolist(), strict=True))
-    shown = plot(
+    curve = plot(
         table(x.tolist(), curves),
         x_name=x_name,
         y_name=f"{name}: {array.description}",
         is_timed=rate is not None,
     )
-    return {**shown, "name": name}
+    return {**curve, "name": name}
 
 
 def _curve_names(array: ArrayLayout, count: int) -> tuple[str, ...]:

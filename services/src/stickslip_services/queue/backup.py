@@ -231,15 +231,15 @@ def _copy_directory(store: DirectoryStore, copy: DirectoryStore, backup: Backup)
 def _copy_bucket(store: Store, copy: DirectoryStore, backup: Backup) -> None:
     """Download the artifacts and the files of versions that the copy lacks."""
     # What is shown was an artifact before, so the list of artifacts, which is made later, has it.
-    shown = set(store.shown())
+    version_files = set(store.version_files())
     for file in store.stored():
         with suppress(FileNotFoundError):
             _copy_artifact(store, copy, file.name, file.bytes, backup)
-    for dataset, version in {(dataset, version) for dataset, version, _ in copy.shown()}:
-        if not any(name[:2] == (dataset, version) for name in shown):
+    for dataset, version in {(dataset, version) for dataset, version, _ in copy.version_files()}:
+        if not any(name[:2] == (dataset, version) for name in version_files):
             copy.hide(dataset, version)
     # The files of a version never change, so those that the copy shows are not read again.
-    for dataset, version, path in sorted(shown - set(copy.shown())):
+    for dataset, version, path in sorted(version_files - set(copy.version_files())):
         with suppress(FileNotFoundError):
             digest = sha256(store.read_shown(dataset, version, path))
             if copy.exists(digest):

@@ -85,11 +85,11 @@ class ShownSample:
             name = f"version {self.opened.version.version} of {self.opened.dataset.id}"
             raise NotFoundError(f"{name} has slots 0 to {last}, not {self.slot}")
 
-    def view(self, shown: Sequence["ShownSample"]) -> dict[str, Any]:
-        """Return what the page shows of it, beside the other one of `shown`."""
-        versions = {sample.path for sample in shown}
+    def view(self, compared: Sequence["ShownSample"]) -> dict[str, Any]:
+        """Return what the page shows of it, beside the other one of `compared`."""
+        versions = {sample.path for sample in compared}
         query = ""
-        for other in shown:
+        for other in compared:
             if other is not self:
                 query = f"?beside={other.slot}"
                 query += "" if other.path == self.path else f"&of={other.place}"
@@ -121,14 +121,14 @@ def get_sample(
     of: OtherVersion = "",
 ) -> Response:
     """Show the pictures, curves, shapes and labels of a sample, or of two samples side by side."""
-    shown = [ShownSample(opened, slot)]
+    compared = [ShownSample(opened, slot)]
     if beside.isdecimal():
-        shown.append(ShownSample(_other(opened, of, context), int(beside)))
-    for sample in shown:
+        compared.append(ShownSample(_other(opened, of, context), int(beside)))
+    for sample in compared:
         sample.check()
     # A rejected sample has labels of its rejection, and no arrays.
-    rejections = [sample.opened.data.rejection(sample.slot) for sample in shown]
-    valid = [sample for sample, lost in zip(shown, rejections, strict=True) if lost is None]
+    rejections = [sample.opened.data.rejection(sample.slot) for sample in compared]
+    valid = [sample for sample, lost in zip(compared, rejections, strict=True) if lost is None]
     views = [sample.view(valid) for sample in valid]
     return html_page(
         "sample.html",
