@@ -64,11 +64,11 @@ def overlaid(views: Sequence[View]) -> list[dict[str, Any]]:
             if key not in joined:
                 joined[key] = {**of_sample, "tables": tables}
                 continue
-            shown = joined[key]
-            shown["tables"] += tables
-            if of_sample["y"] != shown["y"]:
+            joined_curve = joined[key]
+            joined_curve["tables"] += tables
+            if of_sample["y"] != joined_curve["y"]:
                 # Two kinds may describe one array differently.
-                shown["y"] += f"; {view['title']}: {of_sample['y']}"
+                joined_curve["y"] += f"; {view['title']}: {of_sample['y']}"
     return list(joined.values())
 
 
