@@ -9,8 +9,7 @@ import yaml
 from click.testing import CliRunner, Result
 from stickslip_schemas.documents.certificate import Certificate
 from stickslip_schemas.kinds import job_spec_adapter
-from stickslip_schemas.spec.fabrics import measured_fabrics
-from stickslip_schemas.spec.reality import reality
+from stickslip_schemas.spec.reality import measured_fabrics, reality
 from stickslip_services.cli import app
 from stickslip_services.cli.documents import read_job, read_scene
 from stickslip_services.errors import CommandError

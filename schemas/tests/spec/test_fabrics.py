@@ -14,6 +14,7 @@ from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.plan.points import keyed_points
 from stickslip_schemas.spec import fabrics
 from stickslip_schemas.spec.fabrics import FabricNumbers
+from stickslip_schemas.spec.reality import measured_fabrics
 
 BUILDS = Builds(sim_core="9" * 64, simulate="a" * 64, render="b" * 64, pack="c" * 64)
 CARD = {"density": 0.2, "stretching": "gray-interlock", "bending": [1e-5, 2e-5, 4e-6]}
@@ -205,7 +206,7 @@ def test_a_simulation_of_a_scene_has_the_card_of_each_sample() -> None:
 
 
 def test_the_table_of_built_in_fabrics_agrees_with_its_own_numbers() -> None:
-    for facts in fabrics.measured_fabrics().values():
+    for facts in measured_fabrics().values():
         for rigidity, length in zip(facts.bending, facts.bending_length, strict=False):
             computed = 1e3 * fabrics.bending_length(rigidity, facts.density)
             assert math.isclose(computed, length, abs_tol=0.06)

@@ -2,9 +2,8 @@
 
 from pathlib import Path
 
-from stickslip_schemas.spec.fabrics import measured_fabrics
 from stickslip_schemas.spec.names import Material
-from stickslip_schemas.spec.reality import reality
+from stickslip_schemas.spec.reality import measured_fabrics, reality
 
 LABELS = Path(__file__).parents[3] / "docs/labels.md"
 

@@ -6,13 +6,10 @@ many. Each of the three ends as a card with a name, so no other module knows whe
 
 import math
 import random
-import tomllib
 from collections.abc import Mapping, Sequence
 from functools import cache
-from importlib.resources import files
 from statistics import NormalDist
-from types import MappingProxyType
-from typing import Annotated, Any, Literal, NamedTuple, Never, Self, TypeVar, get_args
+from typing import Annotated, Any, Literal, Never, Self, TypeVar, get_args
 
 from pydantic import (
     Discriminator,
@@ -30,6 +27,7 @@ from pydantic_core.core_schema import ErrorType
 from stickslip_schemas.base import WHOLE, Document, Float, content_key
 from stickslip_schemas.spec.axes import Seed, Shorthand, long_form
 from stickslip_schemas.spec.names import Material
+from stickslip_schemas.spec.reality import measured_fabrics
 
 Stiffness = Annotated[Float, Field(ge=0, le=1e6)]
 Rigidity = Annotated[Float, Field(ge=1e-12, le=1)]
@@ -325,47 +323,7 @@ def _moved(item: ErrorDetails, location: Location) -> InitErrorDetails:
     return InitErrorDetails(type=broken, loc=moved, input=item["input"])
 
 
-# ---- The ten built-in fabrics ----------------------------------------------------------------
-
-
-class MeasuredFabric(NamedTuple):
-    """Facts of a built-in fabric: it is one specimen, and its name says no more."""
-
-    density: float
-    """Mass per area [kg/m^2]."""
-    bending: tuple[float, float, float]
-    """Rigidities along the warp, along the weft, and at 45 degrees [N m]."""
-    bending_length: tuple[float, float]
-    """Along the warp and the weft [mm]."""
-    drape: float
-    """Drape coefficient by Cusick's test, simulated [%]: see docs/reality.md for its accuracy."""
-    folds: int
-    """Folds of the draped disc."""
-
-    @property
-    def words(self) -> str:
-        """Bending length and drape in words."""
-        warp, weft = self.bending_length
-        return f"bending length {warp:g} and {weft:g} mm, drape coefficient {self.drape:.0f} %"
-
-
-@cache
-def measured_fabrics() -> Mapping[str, MeasuredFabric]:
-    """Return the built-in fabrics by name; `benchmarks/reality.py` writes their table."""
-    text = files("stickslip_schemas").joinpath("fabrics", "measured.toml").read_text("utf-8")
-    table = tomllib.loads(text)
-    return MappingProxyType(
-        {
-            name: MeasuredFabric(
-                facts["density"],
-                tuple(facts["bending"]),
-                tuple(facts["bending_length"]),
-                facts["drape"],
-                facts["folds"],
-            )
-            for name, facts in table.items()
-        }
-    )
+# ---- Fabrics that are drawn ------------------------------------------------------------------
 
 
 def nearest_by_weight(density: float) -> Material:
@@ -373,8 +331,6 @@ def nearest_by_weight(density: float) -> Material:
     fabrics = measured_fabrics()
     return Material(min(fabrics, key=lambda name: abs(math.log(fabrics[name].density / density))))
 
-
-# ---- Fabrics that are drawn ------------------------------------------------------------------
 
 DRAWN_MAX = 2_000
 """Most fabrics that an axis draws: a spec holds the card of each."""

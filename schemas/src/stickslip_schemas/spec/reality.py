@@ -5,8 +5,10 @@ how far the model is from measurements.
 """
 
 import tomllib
+from collections.abc import Mapping
 from functools import cache
 from importlib.resources import files
+from types import MappingProxyType
 from typing import Literal, NamedTuple
 
 Subject = Literal["cloth", "rods"]
@@ -38,6 +40,46 @@ class YarnFit(NamedTuple):
     """Overhanging length [mm]."""
     bending_length: float
     """[mm]."""
+
+
+class MeasuredFabric(NamedTuple):
+    """Facts of a built-in fabric: it is one specimen, and its name says no more."""
+
+    density: float
+    """Mass per area [kg/m^2]."""
+    bending: tuple[float, float, float]
+    """Rigidities along the warp, along the weft, and at 45 degrees [N m]."""
+    bending_length: tuple[float, float]
+    """Along the warp and the weft [mm]."""
+    drape: float
+    """Drape coefficient by Cusick's test, simulated [%]: see docs/reality.md for its accuracy."""
+    folds: int
+    """Folds of the draped disc."""
+
+    @property
+    def words(self) -> str:
+        """Bending length and drape in words."""
+        warp, weft = self.bending_length
+        return f"bending length {warp:g} and {weft:g} mm, drape coefficient {self.drape:.0f} %"
+
+
+@cache
+def measured_fabrics() -> Mapping[str, MeasuredFabric]:
+    """Return the built-in fabrics by name; `benchmarks/reality.py` writes their table."""
+    text = files("stickslip_schemas").joinpath("fabrics", "measured.toml").read_text("utf-8")
+    table = tomllib.loads(text)
+    return MappingProxyType(
+        {
+            name: MeasuredFabric(
+                facts["density"],
+                tuple(facts["bending"]),
+                tuple(facts["bending_length"]),
+                facts["drape"],
+                facts["folds"],
+            )
+            for name, facts in table.items()
+        }
+    )
 
 
 class Reality(NamedTuple):

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import click
-from stickslip_schemas.spec.fabrics import MeasuredFabric, measured_fabrics
 from stickslip_schemas.spec.names import Material, did_you_mean
+from stickslip_schemas.spec.reality import MeasuredFabric, measured_fabrics
 
 from stickslip_services.cli.common import FILE, CommandGroup, amount, json_option, shows_errors
 from stickslip_services.cli.documents import SCENE_SUFFIXES, read_card

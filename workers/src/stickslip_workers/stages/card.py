@@ -15,9 +15,8 @@ from stickslip_schemas.format.manifest import Manifest, layout
 from stickslip_schemas.format.pictures import labelled, moving, sheet
 from stickslip_schemas.spec.arrays import ArrayLayout, shown_frames
 from stickslip_schemas.spec.axes import AnyAxis, ListAxis
-from stickslip_schemas.spec.fabrics import measured_fabrics
 from stickslip_schemas.spec.jobs import JobSpec
-from stickslip_schemas.spec.reality import Reality, Subject, reality
+from stickslip_schemas.spec.reality import Reality, Subject, measured_fabrics, reality
 
 CARD_NAME = "README.md"
 PREVIEW_NAME = "preview.webp"

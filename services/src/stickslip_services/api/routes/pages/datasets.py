@@ -12,8 +12,7 @@ from sqlalchemy import Connection
 from stickslip_schemas.documents.certificate import Certificate, Numbers, ProtocolReport
 from stickslip_schemas.format.pictures import png
 from stickslip_schemas.spec.arrays import SPLITS
-from stickslip_schemas.spec.fabrics import measured_fabrics
-from stickslip_schemas.spec.reality import reality
+from stickslip_schemas.spec.reality import measured_fabrics, reality
 
 from stickslip_services.addresses import link
 from stickslip_services.api.routes.common import ContextDep
