@@ -22,7 +22,7 @@ BENCHMARKS = $(filter-out $(addprefix benchmarks/, render_rod_set.py cloth_conta
 DISTRIBUTIONS = schemas sim_core measure services training workers workers/blender
 CPP_FILES = $(shell find sim_core/src sim_core/tests/core workers/blender/raster -name "*.[ch]pp")
 
-.PHONY: setup setup-dev demo test-fast test test-kernels test-slow test-main test-blender test-without-blender test-core check size density docs bench reality wheels release-wheels release-check constraints clean
+.PHONY: setup setup-dev demo test-fast test test-kernels test-slow test-main test-blender test-without-blender test-core check complexity size density docs bench reality wheels release-wheels release-check constraints clean
 
 # The environments that `make demo` and the service need. Tests and checks need more: setup-dev.
 setup: .venv/core.stamp .venv-blender/raster.stamp
@@ -103,7 +103,11 @@ test-kernels: setup-dev
 	  STICKSLIP_CLOTH_KERNEL=$$level $(PYTEST) $(KERNEL_TESTS) || exit 1; \
 	done
 
-test-slow: setup-dev
+# Cognitive complexity of the core by clang-tidy, which takes a CPU minute.
+complexity: setup-dev
+	$(PY) tools/complexity.py
+
+test-slow: complexity
 	$(PYTEST) --numprocesses=$$((2 * $$(nproc))) --timeout=1200 -m slow
 	$(BLENDER_PY) -m pytest --quiet -m slow workers/blender
 
