@@ -14,7 +14,7 @@ from stickslip_sim_core.reference import master_curves
 
 # Weights rho_A g L^3 / D [-].
 GAMMA = (0.01, 0.1, 1.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
-FINER = {30.0: 2, 300.0: 4}
+FINER = {30.0: 2, 300.0: 5}
 """Factors by which meshes are finer beyond these weights: the strip bends within a few cells."""
 
 # Without Poisson's effect the width does not matter.
@@ -35,9 +35,9 @@ LONGEST = 1.0  # time step [s]
 STEPS_MAX = 600
 # Share of the length: the strip is at rest if no vertex moves further in a long step.
 REST = 2e-5
-# Share of the weight of 25 mm^2 that is the unit of residuals, on all meshes. The forces of bending
-# at a node do not become smaller with its weight, and single precision of the matrix bounds how
-# exactly they are solved.
+# Share of the weight of 25 mm^2 that is the unit of residuals where meshes are not finer. Forces of
+# bending at a node do not become smaller with its weight, and single precision of the matrix bounds
+# how exactly those of stiff strips are solved.
 FORCE_SHARE = 0.1
 
 
@@ -65,7 +65,7 @@ class Cantilever(RefinedProtocol):
     unstructured: int = 2
 
     def finer(self, x: float) -> int:
-        return max((times for weight, times in FINER.items() if x > weight), default=1)
+        return finer(x)
 
     def measure_with(self, cells: int, x: float, at: Mapping[str, Any]) -> float:
         ratio, cloth = hang(
@@ -76,6 +76,11 @@ class Cantilever(RefinedProtocol):
 
     def master(self, x: float, at: Mapping[str, Any]) -> float:
         return float(master_curves.cantilever(x))
+
+
+def finer(gamma: float) -> int:
+    """Return the factor by which meshes are finer for a weight, and residuals smaller."""
+    return max((times for weight, times in FINER.items() if gamma > weight), default=1)
 
 
 def hang(
@@ -91,7 +96,7 @@ def hang(
         isotropic(DENSITY, stretching * weight, weight * LENGTH**2 / gamma),
         preset,
         held=clamped.held,
-        force_scale=FORCE_SHARE * DENSITY * GRAVITY * RESIDUAL_PATCH,
+        force_scale=FORCE_SHARE / finer(gamma) * DENSITY * GRAVITY * RESIDUAL_PATCH,
     )
     straight = np.stack([clamped.along, clamped.across, np.zeros_like(clamped.along)], axis=1)
     cloth.set_state(straight)
