@@ -223,10 +223,13 @@ def test_faults_are_shown_at_their_fields(server: RunningServer) -> None:
 def test_a_refused_job_is_explained(server: RunningServer) -> None:
     server.worker(kinds=("cloth_scene",))
     uncertified = [pair for pair in BELT if pair[0] != "allow_uncertified"]
-    assert "has no passing certificate" in post(server, "/ui/submit/check", uncertified).text
+    checked = post(server, "/ui/submit/check", uncertified).text
     refused = post(server, "/ui/submit", uncertified).text
     assert "The job was not submitted." in refused
-    assert "has no passing certificate" in refused
+    for page in (checked, refused):
+        # Once, with the way to the box that the message calls by its key.
+        assert page.count("has no passing certificate") == 1
+        assert '<a href="#field-allow_uncertified">tick “allow uncertified”</a>' in page
 
 
 def test_what_is_no_form_is_refused(server: RunningServer) -> None:
