@@ -142,6 +142,9 @@ def tool_named(name: str) -> ModuleType:
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
+    # The programs import each other, from the folder of the one that is run.
+    if str(path.parent) not in sys.path:
+        sys.path.append(str(path.parent))
     spec.loader.exec_module(module)
     return module
 
@@ -172,6 +175,30 @@ def test_packages_of_other_places_do_not_count(monkeypatch: pytest.MonkeyPatch) 
     environment = tool_named("setup_environment").clean_environment()
     assert not {"PYTHONPATH", "PIP_USER"} & environment.keys()
     assert environment["STICKSLIP_OTHER"] == "stays"
+
+
+def test_the_pins_are_looked_up_on_the_index_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A folder of wheels of this machine, from any place of pip's settings, hides no pin."""
+    configuration = tmp_path / "pip.conf"
+    configuration.write_text(
+        "[global]\nindex-url = https://index.test/simple\n"
+        f"find-links = {tmp_path}\nextra-index-url = file://{tmp_path}\n"
+    )
+    monkeypatch.setenv("PIP_CONFIG_FILE", str(configuration))
+    monkeypatch.setenv("PIP_FIND_LINKS", str(tmp_path))
+    monkeypatch.setenv("PIP_EXTRA_INDEX_URL", f"file://{tmp_path}")
+    environment = tool_named("release_check").public_environment(sys.executable)
+    listing = subprocess.run(
+        [sys.executable, "-m", "pip", "config", "list"],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+    assert str(tmp_path) not in listing
+    assert "https://index.test/simple" in listing
 
 
 def test_cpu_time_of_processes_without_a_parent_counts(tmp_path: Path) -> None:

@@ -26,6 +26,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from setup_environment import pip_settings
+
 ROOT = Path(__file__).parents[1]
 MEASUREMENTS = ROOT / "tools" / "setup_measurements.json"
 INDEX_REQUESTS = 8
@@ -47,6 +49,25 @@ class Measurement:
     cpu_seconds: float
 
 
+def public_environment(python: str) -> dict[str, str]:
+    """Return the variables with which pip sees its index alone.
+
+    A folder of wheels or a second index, in a variable or in the configuration of the machine, may
+    have a build of its own, for example PyTorch for CPUs. It would hide that the index has none.
+    """
+    command = [python, "-m", "pip", "config", "list"]
+    listing = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    settings = pip_settings(listing)
+    hiding = ("PIP_FIND_LINKS", "PIP_EXTRA_INDEX_URL")
+    environment = {name: value for name, value in os.environ.items() if name not in hiding}
+    environment["PIP_CONFIG_FILE"] = os.devnull
+    # Where the index is, and how to trust it, is still that of the machine.
+    for setting in ("index-url", "cert"):
+        if setting in settings:
+            environment["PIP_" + setting.replace("-", "_").upper()] = settings[setting]
+    return environment
+
+
 def find_missing_pins(python: str) -> list[str]:
     """Return the pins that the index does not have in their public version."""
     pins = []
@@ -54,9 +75,7 @@ def find_missing_pins(python: str) -> list[str]:
         for line in path.read_text(encoding="utf-8").splitlines():
             if line and not line.startswith("#"):
                 pins.append(line)
-    # A folder of wheels, for example with a CPU build of PyTorch, would hide that the index has
-    # none.
-    environment = {name: value for name, value in os.environ.items() if name != "PIP_FIND_LINKS"}
+    environment = public_environment(python)
 
     def is_missing(pin: str) -> bool:
         name, _, version = pin.partition("==")

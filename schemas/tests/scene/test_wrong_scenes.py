@@ -235,6 +235,7 @@ WRONG: list[tuple[Any, ...]] = [
     ("bodies.upper", {"type": "plane"}, "", "names of their own", '"upper"'),
     ("friction.0.mu", 11.0, "", "less than or equal to 10"),
     ("friction.0.between", ["ball", "floor"], "", "must name two that may touch"),
+    ("friction.0.between", ["ball", "bal"], "", "must name two that may touch; did you mean ball"),
     ("friction.1.between", ["ball", "lower"], "", "must name two once"),
     ("default_friction", GONE, "friction", "missing: actor with lower", "null"),
     ("looks.sheets.napkin", {"texture": "dots"}, "", "must be one of lower", '"napkin"'),

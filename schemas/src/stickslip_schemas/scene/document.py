@@ -269,7 +269,10 @@ class Physics(Document):
             pair = frozenset(entry.between)
             location = ("friction", position, "between")
             if pair not in touching:
-                refuse(self, location, "must name two that may touch", list(entry.between))
+                known = [*self.sheets, *self.bodies]
+                hints = [did_you_mean(name, known) for name in entry.between if name not in known]
+                rule = f"must name two that may touch{''.join(hints)}"
+                refuse(self, location, rule, list(entry.between))
             if pair in listed:
                 refuse(self, location, "must name two once", list(entry.between))
             listed.add(pair)

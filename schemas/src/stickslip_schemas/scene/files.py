@@ -552,8 +552,10 @@ def _check_shape(
 
 
 def _check_values(name: str, values: npt.NDArray[Any]) -> None:
-    if values.dtype.kind not in "fiu" or not np.isfinite(values).all():
-        raise UnfitFileError(f"{name} must be finite numbers, and is {values.dtype} with others")
+    # The gate has let arrays of numbers through alone.
+    wrong = np.argwhere(~np.isfinite(values))
+    if len(wrong):
+        raise UnfitFileError(f"{name} must be finite numbers, and has {values[*wrong[0]]}")
     # All but times are lengths, or rotations and weights of order 1.
     is_length = values.dtype.kind == "f" and "time" not in name
     largest = float(np.abs(values).max()) if is_length else 0.0

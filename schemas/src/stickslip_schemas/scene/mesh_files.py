@@ -122,6 +122,11 @@ def read_polygons(data: bytes, *, with_pattern: bool = False) -> Polygons:
 
 def _check_polygons(polygons: Polygons) -> None:
     """Raise UnfitFileError for positions that are no finite lengths, or unknown vertices."""
+    if not len(polygons.sizes) and not len(polygons.positions):
+        raise UnfitFileError(
+            "must have faces, and has none, nor vertices: is it a mesh, and not a page of a web "
+            "server or a pointer of Git LFS?"
+        )
     if not len(polygons.sizes):
         raise UnfitFileError("must have faces, and has none")
     far = ~(np.abs(polygons.positions) <= FARTHEST).all(axis=1)
