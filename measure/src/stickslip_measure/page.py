@@ -270,7 +270,7 @@ h1 { font-size: 1.4rem; margin: 0 0 .3rem; }
 table { border-collapse: collapse; font-size: 13px; }
 th, td { border: 1px solid #c9ced3; padding: .25rem .4rem; text-align: left; }
 .overview th, .overview td { text-align: center; }
-.overview td { white-space: nowrap; }
+.overview .good, .overview .fair, .overview .poor { white-space: nowrap; }
 .wide { overflow-x: auto; }
 .good { background: #d5efd8; color: #0d3b16; }
 .fair { background: #fbeec2; color: #4d3b00; }
