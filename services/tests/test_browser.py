@@ -112,8 +112,6 @@ def paths(app: FastAPI, worker: PretendWorker) -> list[str]:
     compared = f"{clips[0][1]}/samples/0?beside=1&of={places[1]}"
     return [
         "/",
-        compared,
-        f"/submit?job={clips[0][0].rpartition('/')[2]}",
         *jobs,
         "/datasets",
         root,
@@ -128,6 +126,8 @@ def paths(app: FastAPI, worker: PretendWorker) -> list[str]:
         "/submit?kind=cloth_drag",
         "/scenes",
         f"/scenes/{load_scene('belt').digest}",
+        compared,
+        f"/submit?job={clips[0][0].rpartition('/')[2]}",
     ]
 
 
