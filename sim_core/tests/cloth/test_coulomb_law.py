@@ -57,6 +57,15 @@ def test_the_cone_of_friction_is_round(angle: float) -> None:
         assert law(0.0, n, np.zeros(3), 2.0 * n + size * along, 0.5)[0] == mode
 
 
+@pytest.mark.parametrize(("friction", "mode"), [(0.9, STICK), (1.1, SLIP)])
+def test_what_opens_a_little_sticks_by_the_force_that_it_still_has(
+    friction: float, mode: int
+) -> None:
+    """The gap asks for a normal force of 1.7, and 2 presses: friction up to 1 holds, not 0.85."""
+    n, t, _ = frame(2)
+    assert law(0.1, n, np.zeros(3), 2.0 * n + friction * t, 0.5)[0] == mode
+
+
 @pytest.mark.parametrize(
     ("gap", "slip", "force", "error"),
     [

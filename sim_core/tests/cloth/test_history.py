@@ -125,3 +125,44 @@ def test_a_preset_says_how_many_steps_may_stay_unconverged(share: float, value: 
         cloth.step(0.02, bodies=[plane(0.5, origin=(0.0, 0.0, -0.005))])
     assert cloth.total.unconverged == 1
     assert values(cloth)["unconverged"] == pytest.approx(value)
+
+
+def give_history(cloth: Cloth, monkeypatch: pytest.MonkeyPatch, **columns: ArrayLike) -> None:
+    """Let a cloth have taken steps with these values."""
+    monkeypatch.setattr(cloth.history, "column", lambda name: np.asarray(columns[name]))
+
+
+def value_of(name: str, seen: checks.Seen) -> float:
+    return next(check for check in checks.CHECKS if check.name == name).value(seen)
+
+
+@pytest.mark.parametrize(("end", "largest"), [(None, 9e-4), (2e-5, 1e-4)])
+def test_motion_after_the_last_frame_is_no_jump(
+    end: float | None, largest: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cloth, start = sheet(preset_named("certified"), 0.01, ())
+    give_history(cloth, monkeypatch, motion_error=[1e-4, 9e-4])
+    seen = checks.Seen(cloth, start[None], 0, motion_error_end=end)
+    assert value_of("jumps", seen) == pytest.approx(largest / checks.STEP_ERROR)
+
+
+def test_work_is_judged_against_what_lifts_the_cloth_by_cells(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Where no energy flows."""
+    cloth, start = sheet(preset_named("certified"), 0.01, ())
+    give_history(cloth, monkeypatch, contact_work=[1e-6], flow=[0.0])
+    cell = 0.1 / (np.sqrt(len(start)) - 1.0)
+    lift = checks.FLOW * cloth.masses.sum() * 9.81 * cell
+    assert value_of("contact_gain", checks.Seen(cloth, start[None], 0)) == pytest.approx(
+        1e-6 / lift
+    )
+
+
+@pytest.mark.parametrize(("calm", "may_fail"), [(498, False), (499, True)])
+def test_a_step_may_fail_where_none_of_500_has(
+    calm: int, may_fail: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cloth, _ = sheet(preset_named("certified"), 0.01, ())
+    give_history(cloth, monkeypatch, unconverged=[1.0] + [0.0] * calm)
+    assert checks.Verdict(cloth).allows_failure() == may_fail
