@@ -225,6 +225,7 @@ class Reason(StrEnum):
     penetration = "penetration"
     passages = "passages"
     friction_error = "friction_error"
+    step_error = "step_error"
     # Only jobs end or wait for these.
     cancelled = "cancelled"
     failed_tasks = "failed_tasks"

@@ -109,8 +109,8 @@ void bind_cloth(nb::module_& m) {
       .def_ro("residual", &StepReport::residual, "Largest residual force of a node [N].")
       .def_ro("steps", &StepReport::steps)
       .def_ro("unconverged", &StepReport::unconverged)
-      .def_ro("missed", &StepReport::missed,
-              "Steps of the controller that are further off than it allows.")
+      .def_ro("step_error", &StepReport::step_error,
+              "Largest estimate of how far one step alone misplaces a vertex [m].")
       .def_ro("newton", &StepReport::newton)
       .def_ro("krylov", &StepReport::krylov)
       .def_ro("factorizations", &StepReport::factorizations)
@@ -148,11 +148,12 @@ void bind_cloth(nb::module_& m) {
           [](ClothSolver* self, const Points2& rest, const Triangles& triangles,
              const std::vector<FabricTuple>& fabrics, const std::vector<std::int32_t>& held,
              double tolerance, int newton_max, double krylov_tolerance, int refactor_after,
-             int newton_before_halving, int halvings_max, double step_error, double longest_step,
-             int finest, const std::string& kernel, const std::vector<double>& thickness,
-             const Eigen::MatrixXd& mu, double edge_fraction, double second_fraction,
-             const Triangles& surface_triangles, const std::vector<std::int32_t>& surface_of_vertex,
-             const Points3& surface_positions, const std::vector<double>& crease) {
+             int newton_before_halving, int halvings_max, bool second_order, double step_error,
+             double longest_step, int finest, const std::string& kernel,
+             const std::vector<double>& thickness, const Eigen::MatrixXd& mu, double edge_fraction,
+             double second_fraction, const Triangles& surface_triangles,
+             const std::vector<std::int32_t>& surface_of_vertex, const Points3& surface_positions,
+             const std::vector<double>& crease) {
             std::vector<ClothProperties> list;
             for (const auto& [density, stretching, rigidity, damping] : fabrics) {
               list.push_back({density, stretching, rigidity, damping});
@@ -163,7 +164,7 @@ void bind_cloth(nb::module_& m) {
                              list,
                              held,
                              {tolerance, newton_max, krylov_tolerance, refactor_after,
-                              newton_before_halving, halvings_max},
+                              newton_before_halving, halvings_max, second_order},
                              {step_error, longest_step, finest},
                              kernel,
                              {thickness, mu, static_cast<int>(thickness.size() - crease.size()),
@@ -172,9 +173,9 @@ void bind_cloth(nb::module_& m) {
           },
           "rest"_a, "triangles"_a, "fabrics"_a, "held"_a, nb::kw_only(), "tolerance"_a,
           "newton_max"_a, "krylov_tolerance"_a, "refactor_after"_a, "newton_before_halving"_a,
-          "halvings_max"_a, "step_error"_a, "longest_step"_a, "finest"_a, "kernel"_a, "thickness"_a,
-          "mu"_a, "edge_fraction"_a, "second_fraction"_a, "surface_triangles"_a,
-          "surface_of_vertex"_a, "surface_positions"_a, "crease"_a)
+          "halvings_max"_a, "second_order"_a, "step_error"_a, "longest_step"_a, "finest"_a,
+          "kernel"_a, "thickness"_a, "mu"_a, "edge_fraction"_a, "second_fraction"_a,
+          "surface_triangles"_a, "surface_of_vertex"_a, "surface_positions"_a, "crease"_a)
       .def(
           "set_state",
           [](ClothSolver& self, const Points3& positions, const Points3& velocities,

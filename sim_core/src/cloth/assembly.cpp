@@ -212,10 +212,10 @@ void Assembly::assemble_bending() {
   assembled_stiffening_ = stiffening_;
 }
 
-void Assembly::set_diagonal(double dt, double interval, double damping) {
+void Assembly::set_diagonal(const Inertia& inertia, double damping) {
   for (int i = 0; i < numbering.free_nodes; ++i) {
-    diagonal_[i] =
-        static_cast<float>(mass[i] * (1.0 / (dt * interval) + (damping + own_damping[i]) / dt));
+    const double viscous = (damping + own_damping[i]) / inertia.span[i];
+    diagonal_[i] = static_cast<float>(mass[i] * (inertia.rate[i] + viscous));
   }
 }
 

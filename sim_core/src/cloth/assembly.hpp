@@ -5,6 +5,7 @@
 #include <vector>
 
 #include "cloth/constants.hpp"
+#include "cloth/inertia.hpp"
 #include "cloth/mesh.hpp"
 #include "cloth/numbering.hpp"
 #include "cloth/problem.hpp"
@@ -83,9 +84,8 @@ class Assembly {
   void set_lagged_stretch(const Buffer<double>& x, double fraction) {
     membrane_.set_lagged_stretch(kernel, x.data(), fraction);
   }
-  // Inertia and damping [1/s], on top of the fabrics' own, of a step of dt, and of `interval`
-  // between the velocities before and in it, s.
-  void set_diagonal(double dt, double interval, double damping);
+  // Inertia and damping [1/s], on top of the fabrics' own, of a step.
+  void set_diagonal(const Inertia& inertia, double damping);
   // Mean of a node's block on the diagonal, N/m.
   double own_stiffness(int node) const;
   // That block, N/m.

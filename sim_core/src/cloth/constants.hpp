@@ -79,6 +79,11 @@ constexpr int stalled_late = 2 * stalled_soon;
 // much of that way as other motions do.
 constexpr double tunnel_fraction = 1.0 - path::distance_fraction;
 
+// Weight of the error of nodes of second order. Their errors add up to phases, as nothing damps
+// them: a strip that swings for 2 s is then as far off at its tip as its steps are allowed, ten
+// times over.
+constexpr double second_order_weight = 4.0;
+
 }  // namespace stepping
 
 // Lengths of steps, control.cpp.
@@ -107,6 +112,10 @@ constexpr double dearer = 1.1;
 constexpr double forgiven = 0.02;
 // Weight of the last step in the mean cost of its level: that of three steps. Sweep: within 6 %.
 constexpr double novelty = 0.3;
+// Velocity by which friction that turns may be wrong, times the longest step, over the allowed
+// error, from which a step is taken back. It adds up over the turns of a body that shakes: at 2.0 a
+// patch on a floor that is shaken at 24 to 60 Hz is 1.1 times as far off.
+constexpr double turned_at = 0.5;
 // Halvings of a step that is not solved beyond `finest`. Without any, royal-target dragged for 24 s
 // at mu 0.8 cost 24.8 CPU s in place of 14.5. Sweep: 2 takes 1 % more iterations and 3 % more
 // factors of a fold that is let down.

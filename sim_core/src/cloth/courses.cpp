@@ -6,10 +6,16 @@ namespace sim_core {
 // How the nodes moved in the step that was solved.
 Courses Stepper::courses() const {
   const Numbering& numbering = assembly_.numbering;
-  Courses out{std::vector<Course>(numbering.nodes, Course::bound)};
+  Courses out{std::vector<Course>(numbering.nodes, Course::bound),
+              Buffer<double>(4L * numbering.nodes, 0.0), Buffer<double>(4L * numbering.nodes, 0.0),
+              std::vector<char>(numbering.nodes, 0)};
   for (int i = 0; i < numbering.free_nodes; ++i) {
     if (newton.contact.mode[i] == contact_open) out.of_node[i] = Course::free;
-    if (newton.contact.mode[i] == contact_slip) out.of_node[i] = Course::sliding;
+    if (newton.contact.mode[i] == contact_stick) at_node(out.gain, i) = turns_.gain(i);
+    if (newton.contact.mode[i] != contact_slip) continue;
+    out.of_node[i] = Course::sliding;
+    at_node(out.support, i) = turns_.support(i);
+    out.outrun[i] = turns_.outruns(i);
   }
   if (!newton.pairs) return out;
   for (const Pair& pair : newton.pairs->list()) {

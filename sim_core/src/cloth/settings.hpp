@@ -12,6 +12,7 @@ struct ClothSettings {
   int newton_before_halving;  // iterations of Newton's method after which a step is halved rather
                               // than pursued
   int halvings_max;           // of a step that does not converge
+  bool second_order;          // in time, of free nodes: see velocities.hpp
 };
 
 }  // namespace sim_core

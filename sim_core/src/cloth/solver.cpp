@@ -242,7 +242,9 @@ double ClothSolver::lowest_eigenvalue(const Points3& positions) {
   Assembly& assembly = impl_->assembly;
   const int free_nodes = impl_->numbering.free_nodes;
   const Buffer<double> x = impl_->at(positions);
-  assembly.set_diagonal(period, period, 0.0);
+  Inertia inertia(impl_->numbering.nodes);
+  std::fill(inertia.rate.begin(), inertia.rate.end(), 1.0 / (period * period));
+  assembly.set_diagonal(inertia, 0.0);
   assembly.use_convex_hessian = false;
   assembly.evaluate(x, true);
   const ContactState open(free_nodes);

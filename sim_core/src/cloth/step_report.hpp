@@ -60,7 +60,7 @@ struct StepReport {
   bool converged = true;
   double residual = 0.0;           // N: worst over the parts
   int steps = 0, unconverged = 0;  // steps that were taken, rejected ones apart
-  int missed = 0;  // of those, by steps of the controller that are further off than it allows
+  double step_error = 0.0;  // m: the largest estimate of how far one step alone misplaces a vertex
   int newton = 0, krylov = 0;
   double least_distance =
       std::numeric_limits<double>::infinity();  // m: of cloth from cloth at the ends of steps
@@ -88,7 +88,7 @@ struct StepReport {
     add_work(other);
     steps += other.steps;
     unconverged += other.unconverged;
-    missed += other.missed;
+    step_error = std::max(step_error, other.step_error);
     converged = converged && other.converged;
     if (!(other.residual <= residual)) residual = other.residual;  // a NaN stays
     least_distance = std::min(least_distance, other.least_distance);

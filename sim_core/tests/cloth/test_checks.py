@@ -134,4 +134,4 @@ def test_the_reason_is_the_cause_and_not_what_follows() -> None:
     assert checks.failed({**good, "stretch": 6.4, "penetration": 6.4})[0] == "penetration"
     assert checks.failed({**good, "stretch": 6.4, "passages": 1.0})[0] == "passages"
     assert checks.failed({**good, "stretch": 2.9, "friction_error": 0.5})[0] == "stretch"
-    assert checks.failed({**good, "missed": 1.0})[0] == "", "recorded, and not judged"
+    assert checks.failed({**good, "energy_gain": 1.0})[0] == "", "recorded, and not judged"

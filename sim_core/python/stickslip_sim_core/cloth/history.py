@@ -9,7 +9,7 @@ import numpy as np
 from stickslip_sim_core._sim_core import StepReport
 from stickslip_sim_core.arrays import Floats
 
-_COLUMNS = ("duration", "contact_work", "flow", "unconverged", "missed", "motion_error")
+_COLUMNS = ("duration", "contact_work", "flow", "unconverged", "motion_error")
 
 
 class StepHistory:
@@ -32,7 +32,6 @@ class StepHistory:
             extremes.contact_work,
             extremes.flow,
             report.unconverged,
-            report.missed,
             report.motion_error,
         )
         self._friction[self._steps, : len(extremes.friction)] = np.reshape(
@@ -61,8 +60,8 @@ class StepHistory:
     def column(self, name: str) -> Floats:
         """Return a number of each step: (steps,).
 
-        `duration` [s]; `contact_work` and `flow` [J], see `StepReport.seen`; `unconverged` and
-        `missed`, both 0 or 1; `motion_error` [m], see `StepReport`.
+        `duration` [s]; `contact_work` and `flow` [J], see `StepReport.seen`; `unconverged`, 0
+        or 1; `motion_error` [m], see `StepReport`.
         """
         return self._rows[: self._steps, _COLUMNS.index(name)]
 

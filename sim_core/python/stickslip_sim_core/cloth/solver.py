@@ -34,6 +34,7 @@ PASSED_ON = (
     "refactor_after",
     "newton_before_halving",
     "halvings_max",
+    "second_order",
     "finest",
 )
 """Settings that the C++ solver takes as they are."""

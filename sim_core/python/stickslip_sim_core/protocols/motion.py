@@ -3,7 +3,7 @@
 All have closed forms. The step control of the preset chooses the steps, as in scenes.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -41,13 +41,23 @@ class MotionProtocol(ClothProtocol):
 
     def moved(self, until: float, velocity: Floats, bodies: Sequence[Body], along: Floats) -> float:
         """Return how far a flat patch moves along a direction until a time [s]: mean, in m."""
+        return self.carried(until, velocity, lambda _time: bodies, along)
+
+    def carried(
+        self,
+        until: float,
+        velocity: Floats,
+        bodies: Callable[[float], Sequence[Body]],
+        along: Floats,
+    ) -> float:
+        """Return the same for bodies that move: a function of the time [s]."""
         mesh = meshes.grid(SIDE, SIDE, self.cells, self.cells)
         cloth = Cloth(mesh, fabric(FABRIC), self.solver)
         start = np.column_stack([mesh.rest, np.zeros(len(mesh.rest))])
-        cloth.set_state(start, np.tile(velocity, (len(start), 1)), bodies)
+        cloth.set_state(start, np.tile(velocity, (len(start), 1)), bodies(0.0))
         gravity = cloth.gravity.copy()
         nothing_held = np.empty((0, 3))
-        cloth.advance(until, lambda _time: (gravity, nothing_held, bodies))
+        cloth.advance(until, lambda time: (gravity, nothing_held, bodies(time)))
         self.tally.count(cloth)
         return float((cloth.positions_at(until) - start).mean(axis=0) @ along)
 

@@ -4,6 +4,7 @@ The cloth is a square that is held at two corners.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -145,7 +146,9 @@ def scene(
     return Scene(
         mesh=mesh,
         fabrics=[made],
-        preset=preset_named(preset),
+        # The cloth flops over at each turn of the holders and comes to rest while it is dragged. An
+        # undamped flop takes more steps, and its rest is the same.
+        preset=replace(preset_named(preset), second_order=False),
         start=cloth.positions,
         holders=[Holder(cloth.held, holder_pose)],
         motion=motion_of(cloth, mu),
