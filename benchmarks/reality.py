@@ -23,6 +23,14 @@ from stickslip_sim_core.lab.drape import drape
 
 ROOT = Path(__file__).parents[1]
 RECORD = ROOT / "benchmarks/results/reality.json"
+NEW_RECORD = {
+    "what": "Cusick's drape and the cantilever test of the built-in fabrics, simulated",
+    "command": "python benchmarks/reality.py",
+    "commit": "",
+    "conditions": "",
+}
+"""A record to begin with. You fill in the commit and the conditions."""
+
 TABLE = ROOT / "schemas/src/stickslip_schemas/fabrics/measured.toml"
 PAGE = ROOT / "docs/reality.md"
 
@@ -46,20 +54,27 @@ TABLE_HEAD = """# Facts of the ten fabrics measured by [Wang et al. 2011]; each 
 
 def measured(record: Row) -> Iterator[None]:
     """Measure what a record lacks, and yield after each measurement."""
-    done = {(row["fabric"], row["cell_mm"], row["seed"]) for row in record["drape"]}
+    done = {(row["fabric"], row["cell_mm"], row["seed"]) for row in rows_of(record, "drape")}
     for cell, seeds in sorted(SEEDS.items(), reverse=True):
         for name in fabric_names():
             for seed in seeds:
                 if (name, cell, seed) not in done:
-                    record["drape"].append(draped(name, cell, seed))
+                    record["rows"].append(draped(name, cell, seed))
                     yield
-    tested = {row["fabric"] for row in record["cantilever"]}
+    tested = {row["fabric"] for row in rows_of(record, "cantilever")}
     for name in fabric_names():
         if name not in tested:
             lengths = [cantilever(fabric(name), way).bending_length for way in ("warp", "weft")]
-            row = {"fabric": name, "bending_length_mm": [round(1e3 * v, 2) for v in lengths]}
-            record["cantilever"].append(row)
+            millimetres = [round(1e3 * length, 2) for length in lengths]
+            record["rows"].append(
+                {"test": "cantilever", "fabric": name, "bending_length_mm": millimetres}
+            )
             yield
+
+
+def rows_of(record: Row, test: str) -> list[Row]:
+    """Return the rows of one of the two tests."""
+    return [row for row in record["rows"] if row["test"] == test]
 
 
 def draped(name: str, cell: float, seed: int) -> Row:
@@ -67,6 +82,7 @@ def draped(name: str, cell: float, seed: int) -> Row:
     began = time.process_time()
     result = drape(fabric(name), cell=1e-3 * cell, seed=seed)
     return {
+        "test": "drape",
         "fabric": name,
         "cell_mm": cell,
         "seed": seed,
@@ -81,7 +97,7 @@ def draped(name: str, cell: float, seed: int) -> Row:
 
 def of_fabric(record: Row, name: str, cell: float, key: str) -> list[float]:
     """Return a number of all drape tests of a fabric with a distance of vertices [mm]."""
-    rows = record["drape"]
+    rows = rows_of(record, "drape")
     return [row[key] for row in rows if row["fabric"] == name and row["cell_mm"] == cell]
 
 
@@ -197,7 +213,7 @@ def change_words(record: Row, coarse: float, fine: float) -> str:
 def bending_rows(record: Row) -> Sequence[tuple[str, ...]]:
     """Return the rows of the bending lengths."""
     rows = []
-    for row in record["cantilever"]:
+    for row in rows_of(record, "cantilever"):
         sample = fabric(row["fabric"])
         card = [1e3 * np.cbrt(d / (sample.density * 9.81)) for d in stiffness(sample)[:2]]
         tested = ", ".join(f"{length:.1f}" for length in row["bending_length_mm"])
@@ -246,7 +262,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Drape and bending lengths beside measurements.")
     parser.add_argument("--only-write", action="store_true", help="measure nothing")
     only_write = parser.parse_args().only_write
-    record = json.loads(RECORD.read_text()) if RECORD.exists() else {"drape": [], "cantilever": []}
+    record = json.loads(RECORD.read_text()) if RECORD.exists() else dict(NEW_RECORD, rows=[])
     for _ in () if only_write else measured(record):
         # A measurement takes up to a minute: an interrupted run goes on where it was.
         RECORD.write_text(json.dumps(record, indent=1) + "\n")

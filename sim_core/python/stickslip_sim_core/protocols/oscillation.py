@@ -75,8 +75,8 @@ class Swing(ClothProtocol):
             time = frame / SAMPLES
             if frame:
                 cloth.advance(time, lambda _time: (gravity, start[top], ()))
-            shown = cloth.positions_at(time) if frame else start
-            path.append(shown[below < 1e-9 * LENGTH, 0].mean())
+            positions = cloth.positions_at(time) if frame else start
+            path.append(positions[below < 1e-9 * LENGTH, 0].mean())
         self.tally.count(cloth)
         return np.array(path)
 

@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import minimize_scalar
 
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.rods.clamp import MAX_ANGLE
@@ -142,6 +141,9 @@ class _Search:
                     best_tilt, best, least = tilt, state, residual
         if best is None:
             raise RuntimeError("no rod near the centreline hangs in a stable equilibrium")
+        # scipy is slow to import, and few callers fit a tilt.
+        from scipy.optimize import minimize_scalar
+
         # The minimum is within a step of the best tilt.
         refined = minimize_scalar(
             self.cost,
