@@ -27,9 +27,12 @@ using BodyTuple =
 
 using FabricTuple = std::tuple<double, StretchTable, Eigen::Matrix3d, double>;
 
+using BodyRateTuple = std::tuple<Eigen::Vector3d, Eigen::Vector3d>;
+using DriveRatesTuple = std::tuple<Points3, Points3, std::vector<BodyRateTuple>>;
+
 using ConditionsCallback =
-    std::function<std::tuple<Points3, Points3, Points3, std::vector<BodyTuple>, double>(
-        double time)>;
+    std::function<std::tuple<Points3, Points3, Points3, std::vector<BodyTuple>, double,
+                             std::vector<DriveRatesTuple>>(double time)>;
 
 using TableCallback = std::function<std::pair<Points3, decltype(MotionTable::poses)>(
     const std::vector<double>& times)>;
@@ -37,7 +40,18 @@ using TableCallback = std::function<std::pair<Points3, decltype(MotionTable::pos
 struct DriveNow {
   Points3 gravity, held, surfaces;
   std::vector<Body> bodies;
+  std::vector<DriveRates> rates;
 };
+
+std::vector<DriveRates> rates_of(const std::vector<DriveRatesTuple>& tuples) {
+  std::vector<DriveRates> rates;
+  for (const auto& [held, gravity, bodies] : tuples) {
+    DriveRates by{held, gravity, {}};
+    for (const auto& [origin, turn] : bodies) by.bodies.push_back({origin, turn});
+    rates.push_back(by);
+  }
+  return rates;
+}
 
 std::vector<Body> bodies_of(const std::vector<BodyTuple>& tuples) {
   std::vector<Body> bodies;
@@ -131,6 +145,15 @@ void bind_cloth(nb::module_& m) {
       .def_ro("least_distance", &StepReport::least_distance,
               "Of pieces of cloth that do not hang together, at the ends of steps [m]; infinite "
               "where none are near.");
+  nb::class_<SensitivityReport>(m, "SensitivityReport",
+                                "How well the equations of the sensitivities were solved.")
+      .def_ro("steps", &SensitivityReport::steps)
+      .def_ro("rounds", &SensitivityReport::rounds, "Rounds of refinement, over all parameters.")
+      .def_ro("krylov", &SensitivityReport::krylov)
+      .def_ro("unrefined", &SensitivityReport::unrefined,
+              "Steps of a parameter whose last round changed more than is allowed.")
+      .def_ro("change", &SensitivityReport::change,
+              "Largest last change over the largest derivative.");
   using PairForces = ClothSolver::PairForces;
   nb::class_<PairForces>(m, "PairForces",
                          "Forces of cloth on cloth and surfaces at P pairs of closest points.")
@@ -186,12 +209,29 @@ void bind_cloth(nb::module_& m) {
       .def(
           "step",
           [](ClothSolver& self, double dt, const Points3& gravity, const Points3& held,
-             const Points3& surfaces, const std::vector<BodyTuple>& bodies, double damping) {
+             const Points3& surfaces, const std::vector<BodyTuple>& bodies, double damping,
+             const std::vector<DriveRatesTuple>& rates) {
             const std::vector<Body> list = bodies_of(bodies);
+            const std::vector<DriveRates> by = rates_of(rates);
             nb::gil_scoped_release release;
-            return self.step(dt, gravity, held, surfaces, list, damping);
+            return self.step(dt, gravity, held, surfaces, list, damping, by);
           },
-          "dt"_a, "gravity"_a, "held"_a, "surfaces"_a, "bodies"_a, "damping"_a)
+          "dt"_a, "gravity"_a, "held"_a, "surfaces"_a, "bodies"_a, "damping"_a, "rates"_a)
+      .def(
+          "follow",
+          [](ClothSolver& self, const std::vector<std::tuple<int, int, int>>& parameters) {
+            std::vector<SensitivityParameter> list;
+            for (const auto& [kind, first, second] : parameters) {
+              list.push_back({static_cast<SensitivityParameter::Kind>(kind), first, second});
+            }
+            self.follow(list);
+          },
+          "parameters"_a)
+      .def("position_sensitivities", &ClothSolver::position_sensitivities)
+      .def("velocity_sensitivities", &ClothSolver::velocity_sensitivities)
+      .def("set_sensitivities", &ClothSolver::set_sensitivities, "x"_a, "v"_a)
+      .def("nearest_events", &ClothSolver::nearest_events)
+      .def("sensitivity_report", &ClothSolver::sensitivity_report)
       .def(
           "advance",
           [](ClothSolver& self, double time, double event, const ConditionsCallback& conditions,
@@ -200,9 +240,9 @@ void bind_cloth(nb::module_& m) {
             nb::gil_scoped_release release;
             const auto conditions_at = [&](double at) -> BoundaryConditions {
               nb::gil_scoped_acquire acquire;
-              auto [gravity, held, surfaces, bodies, damping] = conditions(at);
-              now = {gravity, held, surfaces, bodies_of(bodies)};
-              return {now.gravity, now.held, now.surfaces, now.bodies, damping};
+              auto [gravity, held, surfaces, bodies, damping, rates] = conditions(at);
+              now = {gravity, held, surfaces, bodies_of(bodies), rates_of(rates)};
+              return {now.gravity, now.held, now.surfaces, now.bodies, damping, now.rates};
             };
             const auto table_at = [&](const std::vector<double>& times) -> MotionTable {
               nb::gil_scoped_acquire acquire;

@@ -199,6 +199,16 @@ void Assembly::evaluate(const Buffer<double>& x, bool with_matrix) {
   if (with_matrix) assemble_bending();
 }
 
+void Assembly::gradient_of(Energy energy, const Buffer<double>& x, Buffer<double>& out) const {
+  std::fill(out.begin(), out.end(), 0.0);
+  if (energy != Energy::bending) {
+    kernel.membrane(membrane_.data(), x.data(), out.data(), nullptr, false);
+  }
+  if (energy != Energy::membrane) {
+    kernel.bending(bending_.data(), x.data(), out.data(), nullptr, nullptr);
+  }
+}
+
 void Assembly::assemble_bending() {
   float change_max = 0.0f;
   for (std::size_t t = 0; t < rigidity_scale_.size(); ++t) {

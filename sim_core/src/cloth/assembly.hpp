@@ -79,6 +79,9 @@ class Assembly {
   bool use_convex_hessian = false;
 
   void evaluate(const Buffer<double>& x, bool with_matrix);
+  enum class Energy { all, membrane, bending };
+  // Sets `out` (nodes, 4) to the gradient of an energy at x, N, and changes nothing else.
+  void gradient_of(Energy energy, const Buffer<double>& x, Buffer<double>& out) const;
   // From now on stretching lags behind what it is at x by this fraction, none if 0: see
   // kernels/membrane.hpp.
   void set_lagged_stretch(const Buffer<double>& x, double fraction) {

@@ -1,4 +1,5 @@
 // How nodes moved in a step, by their contacts.
+#include "cloth/constants.hpp"
 #include "cloth/stepping.hpp"
 
 namespace sim_core {
@@ -28,6 +29,17 @@ Courses Stepper::courses() const {
     }
     out.pushes_itself = out.pushes_itself || is_cloth;
   }
+  return out;
+}
+
+// How far bodies and surfaces push out what begins a step inside them, or nearer than it may be, m.
+Eigen::Vector3d Stepper::depenetration(int node, const std::vector<Body>& at_start) const {
+  Eigen::Vector3d out = Eigen::Vector3d::Zero();
+  if (node >= assembly_.numbering.free_nodes) return out;
+  if (newton.contact.surfaces && newton.contact.mode[node] != contact_open)
+    out = newton.contact.surfaces->depenetration(node, at_node(start_, node), inside_depth);
+  const Gap gap = newton.contact.body_contact(at_start, at_node(start_, node)).gap;
+  if (gap.distance < -inside_depth) out -= gap.distance * gap.normal;
   return out;
 }
 

@@ -41,6 +41,11 @@ bool LinearSolver::solve(ContactSet* pairs, const Buffer<double>& x, double dt,
   return round == newton::rounds_max;
 }
 
+const Factor* LinearSolver::factor_at_hand(double dt, bool with_pairs) {
+  if (with_pairs) return pair_factor_.age.fits(dt) ? &pair_factor_.view() : nullptr;
+  return factors.latest().age.fits(dt) ? &factors.latest().view() : nullptr;
+}
+
 int LinearSolver::solve_with_pairs(ContactSet& pairs, const Buffer<double>& x, double dt,
                                    StepReport& report) {
   report.factorizations += pair_factor_.renew(assembly_, x, contact_, pairs, dt, settings_);

@@ -131,9 +131,68 @@ void ClothSolver::begin(const std::vector<Body>& bodies, bool begins) {
 
 StepReport ClothSolver::step(double dt, const Points3& gravity, const Points3& held,
                              const Points3& surfaces, const std::vector<Body>& bodies,
-                             double damping) {
+                             double damping, const std::vector<DriveRates>& rates) {
   if (!impl_->stepper.started()) refuse_sharp(bodies, cell_of(impl_->mesh));
-  return impl_->stepper.step(dt, {gravity, held, surfaces, bodies, damping});
+  return impl_->stepper.step(dt, {gravity, held, surfaces, bodies, damping, rates});
+}
+
+void ClothSolver::follow(const std::vector<SensitivityParameter>& parameters) {
+  using Kind = SensitivityParameter::Kind;
+  const Eigen::MatrixXd& mu = impl_->materials.mu;
+  const int sheets = impl_->mesh.sheets;
+  for (const SensitivityParameter& by : parameters) {
+    if (by.kind == Kind::friction_of_body && by.second >= sheets) {
+      refuse(text("parameter: friction must be with one of ", sheets, " sheets, got sheet ",
+                  by.second));
+    }
+    if (by.kind != Kind::friction_of_pair) continue;
+    const bool known = by.first >= 0 && by.second < mu.rows();
+    if (!known || !(mu(by.first, by.second) >= 0.0)) {
+      refuse(text("parameter: friction must be of two sheets, or of a sheet and a surface, that ",
+                  "touch each other, got ", by.first, " and ", by.second));
+    }
+  }
+  impl_->stepper.sensitivities.follow(parameters);
+}
+
+std::vector<Points3> ClothSolver::position_sensitivities() const {
+  const Sensitivities& sensitivities = impl_->stepper.sensitivities;
+  std::vector<Points3> out;
+  for (int p = 0; p < sensitivities.count(); ++p)
+    out.push_back(impl_->unload(sensitivities.positions(p)));
+  return out;
+}
+
+std::vector<Points3> ClothSolver::velocity_sensitivities() const {
+  const Sensitivities& sensitivities = impl_->stepper.sensitivities;
+  std::vector<Points3> out;
+  for (int p = 0; p < sensitivities.count(); ++p)
+    out.push_back(impl_->unload(sensitivities.velocities(p)));
+  return out;
+}
+
+void ClothSolver::set_sensitivities(const std::vector<Points3>& x, const std::vector<Points3>& v) {
+  Sensitivities& sensitivities = impl_->stepper.sensitivities;
+  if (static_cast<int>(x.size()) != sensitivities.count() || v.size() != x.size())
+    refuse("sensitivities: must be one of each parameter");
+  const Buffer<double> zero(4L * impl_->numbering.nodes, 0.0);
+  for (int p = 0; p < sensitivities.count(); ++p) {
+    Buffer<double> positions = zero, velocities = zero;
+    impl_->load(x[p], positions);
+    impl_->load(v[p], velocities);
+    sensitivities.set_state(p, positions, velocities);
+  }
+}
+
+std::vector<double> ClothSolver::nearest_events() const {
+  const Sensitivities& sensitivities = impl_->stepper.sensitivities;
+  std::vector<double> out;
+  for (int p = 0; p < sensitivities.count(); ++p) out.push_back(sensitivities.nearest_event(p));
+  return out;
+}
+
+SensitivityReport ClothSolver::sensitivity_report() const {
+  return impl_->stepper.sensitivities.report();
 }
 
 StepReport ClothSolver::advance(double& time, double event, const PrescribedMotion& motion,

@@ -73,7 +73,19 @@ class ClothSolver {
   // keep their number and order from step to step. `damping`: mass-proportional, 1/s, on top of the
   // fabrics' own.
   StepReport step(double dt, const Points3& gravity, const Points3& held, const Points3& surfaces,
-                  const std::vector<Body>& bodies, double damping);
+                  const std::vector<Body>& bodies, double damping,
+                  const std::vector<DriveRates>& rates);
+
+  // Differentiates the run by these parameters from now on, with derivatives of 0 to begin with.
+  // Throws std::invalid_argument where a parameter names what is not there.
+  void follow(const std::vector<SensitivityParameter>& parameters);
+  // By parameter, (vertices, 3): derivatives of positions and velocities, m and m/s per unit.
+  std::vector<Points3> position_sensitivities() const;
+  std::vector<Points3> velocity_sensitivities() const;
+  void set_sensitivities(const std::vector<Points3>& x, const std::vector<Points3>& v);
+  // By parameter: see Sensitivities::nearest_event.
+  std::vector<double> nearest_events() const;
+  SensitivityReport sensitivity_report() const;
 
   // A step of the controller's choice: see StepController::advance, and Stepper for `may_fail`.
   StepReport advance(double& time, double event, const PrescribedMotion& motion, bool may_fail);

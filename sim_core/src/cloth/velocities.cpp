@@ -26,7 +26,9 @@ Velocities::Velocities(int nodes, int free_nodes, bool second_order)
       x_before_(at_end),
       v_before_(at_end),
       courses_(nodes, Course::free),
-      age_(nodes, 0.0) {}
+      age_(nodes, 0.0),
+      passed_(nodes, 0.0),
+      continued_(nodes, 0) {}
 
 void Velocities::restart() {
   before_ = at_end;
@@ -59,6 +61,7 @@ void Velocities::begin(double dt, Inertia& inertia) {
       age_[i] = 0.0;
     }
     const double passed = age_[i] - 0.5 * dt;
+    passed_[i] = passed > 0.0 && rejuvenates_ ? passed : 0.0;
     if (!(passed > 0.0)) continue;
     age_[i] = 0.5 * dt;
     if (rejuvenates_) at_node(before_, i) += passed * at_node(continuing_, i);
@@ -141,6 +144,7 @@ bool Velocities::update_staggered(int node, double dt, double b, const Vector3d&
   at_node(continuing_, node) = goes_on ? Vector3d(2.0 / dt * change) : at_node(courses.gain, node);
   at_node(at_end, node) = goes_on ? Vector3d(v + change) : v;
   at_node(before_, node) = v;
+  continued_[node] = goes_on;
   return goes_on;
 }
 

@@ -68,6 +68,13 @@ class Velocities {
   double error() const { return error_; }
   // (nodes, 4), m/s^2: of the last step.
   const Buffer<double>& acceleration() const { return acceleration_; }
+  // Of the step at hand, for its derivative: the coefficients of second order, the time [s] by
+  // which the velocity before a node's step was taken forward, and, once the step was taken,
+  // whether the node's acceleration goes on to its end.
+  double a1() const { return a1_; }
+  double a2() const { return a2_; }
+  double passed(int node) const { return passed_[node]; }
+  bool continued(int node) const { return continued_[node] != 0; }
 
  private:
   bool continues(int node, const Courses& courses, const Eigen::Vector3d& at_end,
@@ -85,6 +92,8 @@ class Velocities {
   Buffer<double> x_before_, v_before_;  // (nodes, 4): at the start of the last step, m and m/s
   std::vector<Course> courses_;         // in the last step
   std::vector<double> age_;             // (nodes): of `before_`, s
+  std::vector<double> passed_;          // (nodes), s
+  std::vector<char> continued_;         // (nodes)
   bool rejuvenates_ = true;
   // Whether cloth pushed cloth in the last step, or in the one before: second order would change
   // the momentum of cloth in flight.

@@ -22,13 +22,16 @@ double lean_of_chord(const Vector3d& here, const Vector3d& away, const Vector3d&
 
 }  // namespace
 
-double mu_between_cells(double mu, const NormalsOfCell& normals, const Vector3d& along) {
+FrictionCoefficient mu_between_cells(double mu, const NormalsOfCell& normals,
+                                     const Vector3d& along) {
   // On flat faces nothing leans but by rounding, and mu stays as it is, bit by bit.
   constexpr double flat = 1e-5;  // rad
   const double half_turn = 0.5 * std::abs(lean_of_chord(normals.here, normals.ahead, along) +
                                           lean_of_chord(normals.here, normals.behind, -along));
-  if (!(half_turn > flat)) return mu;
-  return std::tanh(mu * half_turn) / std::tan(half_turn);
+  if (!(half_turn > flat)) return {mu};
+  const double bounded = std::tanh(mu * half_turn);
+  const double slope = std::tan(half_turn);
+  return {bounded / slope, half_turn * (1.0 - bounded * bounded) / slope};
 }
 
 }  // namespace sim_core

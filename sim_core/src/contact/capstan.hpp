@@ -21,7 +21,14 @@ struct NormalsOfCell {
   Eigen::Vector3d behind, here, ahead;
 };
 
-// The coefficient mu' of a node. `along`: unit direction of friction.
-double mu_between_cells(double mu, const NormalsOfCell& normals, const Eigen::Vector3d& along);
+// The coefficient mu' of a node, and its derivative by mu.
+struct FrictionCoefficient {
+  double mu;
+  double by_mu = 1.0;
+};
+
+// `along`: unit direction of friction.
+FrictionCoefficient mu_between_cells(double mu, const NormalsOfCell& normals,
+                                     const Eigen::Vector3d& along);
 
 }  // namespace sim_core

@@ -49,6 +49,30 @@ void turn(Pair& pair, const Buffer<double>& x) {
 
 }  // namespace
 
+void PairArrays::clear() {
+  nodes_.clear();
+  weights_.clear();
+  stiffness_.clear();
+}
+
+void PairArrays::add(const Pair& pair, int free_nodes) {
+  for (int node : pair.stencil.node) nodes_.push_back(node < free_nodes ? node : -1);
+  for (const Vector4d* weights : {&pair.weights, &pair.along_first, &pair.along_second}) {
+    for (int c = 0; c < 4; ++c) weights_.push_back(static_cast<float>((*weights)[c]));
+  }
+  const Eigen::Matrix<double, 9, 9> stiffness = pair.stiffness();
+  for (int column = 0; column < 9; ++column) {
+    for (int r = 0; r < 9; ++r) {
+      stiffness_.push_back(static_cast<float>(stiffness(r, column)));
+      if (r % 3 == 2) stiffness_.push_back(0.0f);
+    }
+  }
+}
+
+PairData PairArrays::data() const {
+  return {static_cast<int>(nodes_.size() / 4), nodes_.data(), weights_.data(), stiffness_.data()};
+}
+
 PairPast::PairPast(const Pair& pair)
     : stencil(pair.stencil),
       feature(pair.feature),
@@ -238,24 +262,11 @@ void ContactSet::linearize_at(const Buffer<double>& x) {
 }
 
 PairData ContactSet::rows() {
-  nodes_.clear();
-  weights_.clear();
-  stiffness_.clear();
+  rows_.clear();
   for (const Pair& pair : pairs_) {
-    if (!pair.active()) continue;
-    for (int node : pair.stencil.node) nodes_.push_back(node < free_nodes_ ? node : -1);
-    for (const Vector4d* weights : {&pair.weights, &pair.along_first, &pair.along_second}) {
-      for (int c = 0; c < 4; ++c) weights_.push_back(static_cast<float>((*weights)[c]));
-    }
-    const Eigen::Matrix<double, 9, 9> stiffness = pair.stiffness();
-    for (int column = 0; column < 9; ++column) {
-      for (int r = 0; r < 9; ++r) {
-        stiffness_.push_back(static_cast<float>(stiffness(r, column)));
-        if (r % 3 == 2) stiffness_.push_back(0.0f);
-      }
-    }
+    if (pair.active()) rows_.add(pair, free_nodes_);
   }
-  return {static_cast<int>(nodes_.size() / 4), nodes_.data(), weights_.data(), stiffness_.data()};
+  return rows_.data();
 }
 
 void ContactSet::subtract_right_side(Buffer<float>& force) const {

@@ -55,6 +55,18 @@ struct Pair {
   Eigen::Matrix<double, 9, 9> stiffness() const;
 };
 
+// Pairs in the plain arrays that kernels read.
+class PairArrays {
+ public:
+  void clear();
+  void add(const Pair& pair, int free_nodes);
+  PairData data() const;
+
+ private:
+  std::vector<int> nodes_;
+  Buffer<float> weights_, stiffness_;
+};
+
 // Record of a pair at an earlier iterate.
 struct PairPast {
   Candidate stencil;
@@ -166,8 +178,7 @@ class ContactSet {
   std::vector<NearFeature> near_features_;       // of the vertex at hand
   std::vector<Pair> pairs_;                      // sorted by kind, first, feature
   std::vector<PairPast> base_, history_, best_;  // likewise
-  std::vector<int> nodes_;                       // of `rows`
-  Buffer<float> weights_, stiffness_;
+  PairArrays rows_;
 };
 
 }  // namespace sim_core

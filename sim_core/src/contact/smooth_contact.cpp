@@ -143,10 +143,14 @@ Vector3d SmoothContact::depenetration(int node, const Vector3d& before, double a
 // somewhere, while that place was at y0 + Q^T (p - y); Q turns the surface's axes from then to now.
 Vector3d SmoothContact::slip(int node, const Vector3d& before, const Vector3d& p) const {
   const Projection& projection = projections_[node];
-  const Matrix3d turn = patches_.axes(end_, projection.triangle, projection.weights) *
-                        patches_.axes(start_, projection.triangle, projection.weights).transpose();
   return p - projection.point +
-         turn * (patches_.point(start_, projection.triangle, projection.weights) - before);
+         turn(node) * (patches_.point(start_, projection.triangle, projection.weights) - before);
+}
+
+Matrix3d SmoothContact::turn(int node) const {
+  const Projection& projection = projections_[node];
+  return patches_.axes(end_, projection.triangle, projection.weights) *
+         patches_.axes(start_, projection.triangle, projection.weights).transpose();
 }
 
 double SmoothContact::mu(int node) const {
@@ -158,6 +162,14 @@ Vector3d SmoothContact::normal_near(int node, const Vector3d& p) const {
   const std::optional<Projection> found =
       patches_.projection(end_, p, last.triangle, touched_.side[node]);
   return found ? found->normal : last.normal;
+}
+
+std::optional<SmoothTouch> SmoothContact::touch_near(int node, const Vector3d& p) const {
+  const std::optional<Projection> found =
+      patches_.projection(end_, p, projections_[node].triangle, touched_.side[node]);
+  if (!found) return std::nullopt;
+  return SmoothTouch{found->height - rest_distance(end_, node, *found), found->normal,
+                     surface_of(found->triangle) - materials_.sheets};
 }
 
 }  // namespace sim_core

@@ -6,7 +6,6 @@
 #include <limits>
 #include <utility>
 
-#include "contact/capstan.hpp"
 #include "contact/constants.hpp"
 #include "contact/rows.hpp"
 
@@ -233,7 +232,7 @@ bool ContactState::warm_start(const Buffer<double>& x, const Buffer<double>& sta
 Vector3d ContactState::slip(const BodyContact& on, const Vector3d& before, const Vector3d& p,
                             const std::vector<Body>& at_start, const std::vector<Body>& at_end) {
   const auto over = [&](int b) -> Vector3d { return p - carried(at_start[b], at_end[b], before); };
-  const Vector3d u = on.opposite < 0 ? on.mean(over) : 0.5 * (over(on.body) + over(on.opposite));
+  const Vector3d u = on.average(over);
   return u - u.dot(on.gap.normal) * on.gap.normal;
 }
 
@@ -241,42 +240,40 @@ Contact ContactState::contact_at(int node, const BodyContact& on, const Buffer<d
                                  const Buffer<double>& start, const Buffer<double>& residual,
                                  const std::vector<Body>& at_start,
                                  const std::vector<Body>& at_end) const {
-  const Vector3d before = at_node(start, node), p = at_node(x, node), &n = on.gap.normal;
+  const Vector3d before = at_node(start, node);
+  const Vector3d p = at_node(x, node);
+  const Vector3d& n = on.gap.normal;
+  const bool on_surface = on.body >= static_cast<int>(at_end.size());
+  Vector3d u = on_surface ? surfaces->slip(node, before, p) : slip(on, before, p, at_start, at_end);
+  if (on_surface) u -= u.dot(n) * n;
   const Vector3d pressing = press(on, node);
   const Vector3d force = at_node(residual, node) - pressing;
-  if (on.body >= static_cast<int>(at_end.size())) {
-    const Vector3d u = surfaces->slip(node, before, p);
-    Contact out{on.gap.distance, n, u - u.dot(n) * n, force, surfaces->mu(node), stiffness[node]};
-    out.mu = corrected_mu(out, node, p,
-                          [&](const Vector3d& near) { return surfaces->normal_near(node, near); });
-    return out;
-  }
-  const auto mu_with = [&](int b) { return at_end[b].mu_of(sheet[node]); };
-  const double mu_here =
-      on.opposite < 0 ? on.mean(mu_with) : 0.5 * (mu_with(on.body) + mu_with(on.opposite));
-  Contact out{on.gap.distance, n,       slip(on, before, p, at_start, at_end),
-              force,           mu_here, stiffness[node]};
-  out.pressed = pressing.norm();
-  // Planes are flat, and fillets hollow: there cloth does not turn at nodes.
-  const Body& body = at_end[on.body];
-  if (body.shape != Body::plane && on.neighbours[0] < 0 && on.opposite < 0) {
-    out.mu =
-        corrected_mu(out, node, p, [&](const Vector3d& near) { return gap_of(body, near).normal; });
-  }
+  Contact out{on.gap.distance, n, u, force, 0.0, stiffness[node], pressing.norm()};
+  // Friction points where the law asks for it at the iterate.
+  const Vector3d asked = out.friction() - out.stiffness * out.slip;
+  out.mu = mu_at(node, on, p, asked, at_end).mu;
   return out;
 }
 
-// Half a cell before and behind along friction, which is what the law asks for at the iterate.
-template <class NormalAt>
-double ContactState::corrected_mu(const Contact& contact, int node, const Vector3d& p,
-                                  const NormalAt& normal_at) const {
-  const Vector3d friction = contact.friction() - contact.stiffness * contact.slip;
+// Half a cell before and behind along friction. Planes are flat, and fillets hollow: there cloth
+// does not turn at nodes.
+FrictionCoefficient ContactState::mu_at(int node, const BodyContact& on, const Vector3d& p,
+                                        const Vector3d& friction,
+                                        const std::vector<Body>& at_end) const {
+  const bool on_surface = on.body >= static_cast<int>(at_end.size());
+  const double mu = on_surface ? surfaces->mu(node)
+                               : on.average([&](int b) { return at_end[b].mu_of(sheet[node]); });
+  const bool turns = on_surface || (at_end[on.body].shape != Body::plane && on.neighbours[0] < 0 &&
+                                    on.opposite < 0);
   const double size = friction.norm();
-  if (!(contact.mu > 0.0 && size > 0.0)) return contact.mu;
+  if (!(turns && mu > 0.0 && size > 0.0)) return {mu};
   const Vector3d along = friction / size;
   const Vector3d half_cell = 0.5 * cell[node] * along;
-  return mu_between_cells(
-      contact.mu, {normal_at(p - half_cell), contact.normal, normal_at(p + half_cell)}, along);
+  const auto normal_at = [&](const Vector3d& near) -> Vector3d {
+    return on_surface ? surfaces->normal_near(node, near) : gap_of(at_end[on.body], near).normal;
+  };
+  return mu_between_cells(mu, {normal_at(p - half_cell), on.gap.normal, normal_at(p + half_cell)},
+                          along);
 }
 
 void ContactState::write(int node, const NodeRow& row) {

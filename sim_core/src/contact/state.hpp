@@ -10,6 +10,7 @@
 #include <vector>
 
 #include "contact/bodies.hpp"
+#include "contact/capstan.hpp"
 #include "contact/closest.hpp"
 #include "contact/linearized_contact.hpp"
 #include "contact/pn_triangles.hpp"
@@ -63,8 +64,12 @@ class SmoothContact {
   // began, m; friction; and the projection.
   Eigen::Vector3d slip(int node, const Eigen::Vector3d& before, const Eigen::Vector3d& p) const;
   double mu(int node) const;
+  // By which the surface turned in the step where the node saw it last.
+  Eigen::Matrix3d turn(int node) const;
   // The normal at p, which is near what the node saw last: that one where there is no projection.
   Eigen::Vector3d normal_near(int node, const Eigen::Vector3d& p) const;
+  // What the node sees at p, which is near what it saw last. It remembers nothing of it.
+  std::optional<SmoothTouch> touch_near(int node, const Eigen::Vector3d& p) const;
   const Projection& projection(int node) const { return projections_[node]; }
   const std::vector<std::array<int, 3>>& triangles() const { return patches_.triangles(); }
 
@@ -118,6 +123,14 @@ struct BodyContact {
     const auto own = of(body);
     auto out = own;
     for (int k = 0; k < 2 && neighbours[k] >= 0; ++k) out += weights[k] * (of(neighbours[k]) - own);
+    return out;
+  }
+
+  // The same, or of both sides where there is an opposite body.
+  template <class Of>
+  auto average(const Of& of) const {
+    auto out = mean(of);
+    if (opposite >= 0) out = 0.5 * (of(body) + of(opposite));
     return out;
   }
 };
@@ -174,20 +187,21 @@ class ContactState {
 
   ContactRows rows() const;
 
+  // The contact of a node at x, which was at `start` when the step began.
+  Contact contact_at(int node, const BodyContact& on, const Buffer<double>& x,
+                     const Buffer<double>& start, const Buffer<double>& residual,
+                     const std::vector<Body>& at_start, const std::vector<Body>& at_end) const;
+  // Coefficient of friction of a node at p, whose friction points along `friction`, of any length;
+  // see capstan.hpp.
+  FrictionCoefficient mu_at(int node, const BodyContact& on, const Eigen::Vector3d& p,
+                            const Eigen::Vector3d& friction, const std::vector<Body>& at_end) const;
+
   // Contact of a node as a penalty, for factors: xx xy xz yy yz zz, N/m. k n n^T where it slips,
   // and against a turn of friction; k in all directions where it sticks; k by the node's own
   // stiffness.
   void penalty(int node, double own, float* out) const;
 
  private:
-  Contact contact_at(int node, const BodyContact& on, const Buffer<double>& x,
-                     const Buffer<double>& start, const Buffer<double>& residual,
-                     const std::vector<Body>& at_start, const std::vector<Body>& at_end) const;
-  // Coefficient of friction of a contact at p, see capstan.hpp; `normal_at`: of the face near a
-  // point.
-  template <class NormalAt>
-  double corrected_mu(const Contact& contact, int node, const Eigen::Vector3d& p,
-                      const NormalAt& normal_at) const;
   void write(int node, const NodeRow& row);
 
   struct History {

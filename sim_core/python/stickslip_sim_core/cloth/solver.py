@@ -10,7 +10,13 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stickslip_sim_core._sim_core import ClothSolver, PairForces, StepReport, sheet_count
+from stickslip_sim_core._sim_core import (
+    ClothSolver,
+    PairForces,
+    SensitivityReport,
+    StepReport,
+    sheet_count,
+)
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth.contact import (
     BEARING,
@@ -24,6 +30,7 @@ from stickslip_sim_core.cloth.fabrics import Fabric
 from stickslip_sim_core.cloth.history import StepHistory
 from stickslip_sim_core.cloth.meshes import Mesh
 from stickslip_sim_core.cloth.presets import SolverSettings
+from stickslip_sim_core.cloth.sensitivities import Parameter, RatesTuple
 
 KERNEL_VARIABLE = "STICKSLIP_CLOTH_KERNEL"
 """Environment variable that sets the level of the kernels."""
@@ -153,6 +160,9 @@ class Cloth:
         self._solver = self._make(held=self.held.tolist())
         # Time, positions and velocities before the last step. The time inf stands for no step yet.
         self._before = (np.inf, np.empty((0, 3)), np.empty((0, 3)))
+        self._parameters: tuple[Parameter, ...] = ()
+        # Derivatives of positions and velocities before the last step, as `_before`.
+        self._before_sensitivities = (self._no_sensitivities(), self._no_sensitivities())
         self.total = StepReport()
         """Report of all steps: counts, least distances, and in `seen` the values for `checks`."""
         self.history = StepHistory()
@@ -292,6 +302,8 @@ class Cloth:
             [body.as_tuple() for body in bodies],
             begins=True,
         )
+        # The derivatives of a state that a user gives are zero until the user gives them, too.
+        self._solver.follow([parameter.as_tuple() for parameter in self._parameters])
 
     def hold(self, vertices: ArrayLike, bodies: Sequence[Body] = ()) -> None:
         """Prescribe the positions of these vertices (K,) from now on, and let go of all others.
@@ -304,6 +316,7 @@ class Cloth:
         """
         # The set of held vertices decides the unknowns of the C++ solver, so it needs a new one.
         positions, velocities = self.positions, self.velocities
+        sensitivities = self.sensitivities, self.velocity_sensitivities
         self.held = np.asarray(vertices, dtype=np.int32).reshape(-1)
         self._solver = self._make(held=self.held.tolist())
         around = [body.as_tuple() for body in bodies]
@@ -311,6 +324,9 @@ class Cloth:
         self._solver.set_state(
             positions, velocities, self._surfaces_at(self.time), around, begins=False
         )
+        if self._parameters:
+            self.follow(self._parameters)
+            self.set_sensitivities(*sensitivities)
 
     def step(
         self, dt: float, *, held: ArrayLike = (), bodies: Sequence[Body] = (), damping: float = 0.0
@@ -331,6 +347,7 @@ class Cloth:
             self._surfaces_at(self.time + dt),
             [body.as_tuple() for body in bodies],
             damping,
+            self._rates_at(self.time + dt),
         )
         self.time += dt
         self.total.add(report)
@@ -376,13 +393,16 @@ class Cloth:
             raise ValueError("end: must be a number, got nan")
 
         # The solver calls `drive` for the end of a step.
-        def drive(time: float) -> tuple[Floats, Floats, Floats, list[BodyTuple], float]:
+        def drive(
+            time: float,
+        ) -> tuple[Floats, Floats, Floats, list[BodyTuple], float, list[RatesTuple]]:
             self.gravity, held, bodies = motion(time)
             ends, tuples = (
                 np.asarray(held, float).reshape(-1, 3),
                 [body.as_tuple() for body in bodies],
             )
-            return self.gravity, ends, self._surfaces_at(time), tuples, damping(time)
+            surfaces = self._surfaces_at(time)
+            return self.gravity, ends, surfaces, tuples, damping(time), self._rates_at(time)
 
         # The solver calls `track` for many times within a step, to see whether the motion is even.
         def track(times: Sequence[float]) -> tuple[Floats, Floats]:
@@ -403,6 +423,7 @@ class Cloth:
         while self.time < end and self.spent <= 1.0:
             # `positions_at` interpolates between the two ends of this step.
             self._before = self.time, self.positions, self.velocities
+            self._before_sensitivities = self.sensitivities, self.velocity_sensitivities
             self.time, report = self._solver.advance(self.time, event, drive, track, may_fail())
             self.total.add(report)
             self.history.add(self.time - self._before[0], report)
@@ -434,18 +455,101 @@ class Cloth:
         """
         if time == self.time:
             return self.positions
-        begin, x, v = self._before
+        _, x, v = self._before
+        return self._between(time, (x, v), (self.positions, self.velocities), straight=straight)
+
+    def _between(
+        self,
+        time: float,
+        before: tuple[Floats, Floats],
+        now: tuple[Floats, Floats],
+        *,
+        straight: bool,
+    ) -> Floats:
+        """Return values at a time in the last step, from values and rates at its ends."""
+        begin = self._before[0]
         if not begin <= time < self.time:
             raise ValueError(
                 f"time: must be in the last step, {begin:g} ... {self.time:g} s, got {time:g}"
             )
         # Hermite's cubic: the straight part with zero velocities, and a bent part for velocities.
         h, s = self.time - begin, (time - begin) / (self.time - begin)
-        way = self.positions - x
+        (x, v), (x_end, v_end) = before, now
+        way = x_end - x
         if straight:
             return np.asarray(x + s * way)
-        bent = h * s * (1.0 - s) * ((1.0 - s) * v - s * self.velocities)
+        bent = h * s * (1.0 - s) * ((1.0 - s) * v - s * v_end)
         return np.asarray(x + s * s * (3.0 - 2.0 * s) * way + bent)
+
+    def follow(self, parameters: Sequence[Parameter]) -> None:
+        """Differentiate the run by these parameters from now on.
+
+        The derivatives of the state are zero until `set_sensitivities`. Positions have the same
+        bits with and without.
+
+        Raises:
+            ValueError: A parameter is friction of what does not touch the cloth.
+        """
+        self._parameters = tuple(parameters)
+        self._solver.follow([parameter.as_tuple() for parameter in self._parameters])
+        self._before_sensitivities = (self._no_sensitivities(), self._no_sensitivities())
+
+    def set_sensitivities(self, positions: ArrayLike, velocities: ArrayLike | None = None) -> None:
+        """Set the derivatives of the state by each parameter.
+
+        Args:
+            positions: Of positions (P, V, 3) [m per unit of the parameter].
+            velocities: Of velocities (P, V, 3) [m/s per unit]. None is zero.
+
+        Raises:
+            ValueError: An array has another shape.
+        """
+        x = np.asarray(positions, float)
+        v = np.zeros_like(x) if velocities is None else np.asarray(velocities, float)
+        self._solver.set_sensitivities(list(x), list(v))
+
+    def _no_sensitivities(self) -> Floats:
+        return np.zeros((len(self._parameters), len(self.mesh.rest), 3))
+
+    @property
+    def sensitivities(self) -> Floats:
+        """Derivatives of the positions by each parameter: (P, V, 3) [m per unit]."""
+        derivatives = self._solver.position_sensitivities()
+        return np.reshape(derivatives, (-1, len(self.mesh.rest), 3))
+
+    @property
+    def velocity_sensitivities(self) -> Floats:
+        """Derivatives of the velocities by each parameter: (P, V, 3) [m/s per unit]."""
+        derivatives = self._solver.velocity_sensitivities()
+        return np.reshape(derivatives, (-1, len(self.mesh.rest), 3))
+
+    @property
+    def nearest_events(self) -> Floats:
+        """How far each parameter may change until a contact changes its branch: (P,).
+
+        It is an estimate to first order from the last step, in units of the parameter. The
+        derivative is that of one side where the distance is 0.
+        """
+        return np.asarray(self._solver.nearest_events(), float)
+
+    @property
+    def sensitivity_report(self) -> SensitivityReport:
+        """How well the equations of the derivatives were solved."""
+        return self._solver.sensitivity_report()
+
+    def sensitivities_at(self, time: float, *, straight: bool = False) -> Floats:
+        """Return the derivatives of `positions_at` (P, V, 3) [m per unit].
+
+        Raises:
+            ValueError: The time is not in the last step.
+        """
+        if time == self.time or not self._parameters:
+            return self.sensitivities
+        now = self.sensitivities, self.velocity_sensitivities
+        return self._between(time, self._before_sensitivities, now, straight=straight)
+
+    def _rates_at(self, time: float) -> list[RatesTuple]:
+        return [parameter.rates_at(time) for parameter in self._parameters]
 
     @property
     def momentum_rate(self) -> Floats:

@@ -1,0 +1,108 @@
+"""Parameters that a run of cloth can be differentiated by.
+
+`Cloth.follow` takes them. The derivatives are exact for the discrete run: they are those of the
+positions that the solver computes, with the lengths of its steps and the branches of its contacts
+held. `Cloth.nearest_events` says how far a parameter may change until a branch changes.
+
+`cloth/sensitivities.hpp` has the equations.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from stickslip_sim_core.arrays import Floats
+
+Kind: TypeAlias = Literal[
+    "friction_of_body", "friction_of_pair", "bending", "stretching", "density", "drive"
+]
+
+# The numbers of SensitivityParameter::Kind.
+_NUMBERS: dict[Kind, int] = {
+    "friction_of_body": 0,
+    "friction_of_pair": 1,
+    "bending": 2,
+    "stretching": 3,
+    "density": 4,
+    "drive": 5,
+}
+
+RatesTuple: TypeAlias = tuple[Floats, Floats, list[tuple[Floats, Floats]]]
+"""Derivatives of held vertices, of gravity, and of the origin and turn of each body."""
+
+
+def _no_points() -> Floats:
+    return np.empty((0, 3))
+
+
+@dataclass(frozen=True)
+class DriveRates:
+    """Derivatives of what drives the cloth at one time by a parameter.
+
+    Empty arrays are zero.
+
+    Attributes:
+        held: Of the positions of held vertices (K, 3) [m per unit of the parameter].
+        gravity: Of gravity at the vertices (V, 3) [m/s^2 per unit].
+        bodies: Of each body, that of its origin (3,) [m per unit], and its turn about the origin
+            (3,) [rad per unit], a vector along the axis.
+    """
+
+    held: Floats = field(default_factory=_no_points)
+    gravity: Floats = field(default_factory=_no_points)
+    bodies: Sequence[tuple[Floats, Floats]] = ()
+
+    def as_tuple(self) -> RatesTuple:
+        return self.held, self.gravity, list(self.bodies)
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter of a run.
+
+    Use the constructors below: `friction`, `pair_friction`, `fabric_factor` and `drive`.
+    """
+
+    kind: Kind
+    first: int = -1
+    second: int = -1
+    rates: Callable[[float], DriveRates] | None = None
+
+    def as_tuple(self) -> tuple[int, int, int]:
+        return _NUMBERS[self.kind], self.first, self.second
+
+    def rates_at(self, time: float) -> RatesTuple:
+        """Return what drives the cloth depends on the parameter at a time [s]."""
+        return (self.rates(time) if self.rates else DriveRates()).as_tuple()
+
+
+def friction(body: int, sheet: int | None = None) -> Parameter:
+    """Return the coefficient of friction of a body, with one sheet or with all."""
+    return Parameter("friction_of_body", body, -1 if sheet is None else sheet)
+
+
+def pair_friction(first: int, second: int) -> Parameter:
+    """Return the coefficient of friction of two sheets, of a sheet with itself or with a surface.
+
+    Surfaces are counted after the sheets.
+    """
+    return Parameter("friction_of_pair", min(first, second), max(first, second))
+
+
+def fabric_factor(kind: Literal["bending", "stretching", "density"]) -> Parameter:
+    """Return the logarithm of a factor of a property of all fabrics.
+
+    The derivative by the property D itself is the derivative by the logarithm over D.
+    """
+    return Parameter(kind)
+
+
+def drive(rates: Callable[[float], DriveRates]) -> Parameter:
+    """Return a parameter that moves held vertices, bodies or gravity.
+
+    Args:
+        rates: Function of the time [s] that returns the derivatives of what drives the cloth.
+    """
+    return Parameter("drive", rates=rates)

@@ -1,0 +1,26 @@
+// What contacts of nodes and of pairs share in the sensitivities.
+#pragma once
+
+#include <Eigen/Core>
+#include <cmath>
+#include <limits>
+
+#include "cloth/sensitivities.hpp"
+
+namespace sim_core {
+
+constexpr double infinite = std::numeric_limits<double>::infinity();
+// Stiffness against a turn of friction over that of the law, from which a contact is as good as
+// stuck.
+constexpr double turning_max = 1e4;
+
+// The change of a parameter that takes `margin` to 0, to first order.
+inline double event_at(double margin, double rate) {
+  return rate != 0.0 ? std::abs(margin / rate) : infinite;
+}
+
+inline Eigen::Vector3d in_plane(const Eigen::Vector3d& vector, const Eigen::Vector3d& normal) {
+  return vector - vector.dot(normal) * normal;
+}
+
+}  // namespace sim_core

@@ -1,0 +1,134 @@
+// How pairs of closest points enter the sensitivities.
+#include <algorithm>
+
+#include "cloth/sensitive_contacts.hpp"
+
+namespace sim_core {
+
+using Eigen::Vector3d;
+
+// The pairs that bear a force, and what of them does not depend on the parameter. Weights are
+// stationary for distances, not for slips. How much rho turns in the step is taken for a constant.
+void Sensitivities::classify_pairs(const Step& step) {
+  pairs_.clear();
+  pair_arrays_.clear();
+  if (!newton_.pairs) return;
+  ContactSet& pairs = *newton_.pairs;
+  for (const Pair& pair : pairs.list()) {
+    if (!pair.active() || pair.contact.force.isZero(0.0)) continue;
+    PairContact contact;
+    contact.pair = &pair;
+    contact.turn = pairs.turn_of(pair.stencil, pair.weights);
+    const FourPoints now = points_of(pair.stencil, step.x),
+                     before = points_of(pair.stencil, step.start);
+    contact.along_now << between_closest(pair.along_first, now),
+        between_closest(pair.along_second, now);
+    contact.along_start << between_closest(pair.along_first, before),
+        between_closest(pair.along_second, before);
+    contact.way =
+        between_closest(pair.weights, now) - contact.turn * between_closest(pair.weights, before);
+    contact.distance = pair.contact.gap + pair.thickness;
+    const Contact& at = pair.contact;
+    if (pair.row.mode == contact_slip) {
+      const Vector3d slip = in_plane(contact.way, at.normal);
+      const Vector3d asked = at.friction() - at.stiffness * slip;
+      const double bound = at.mu * std::max(at.normal_force(), 0.0);
+      const double most = turning_max * at.stiffness, length = slip.norm();
+      contact.direction =
+          asked.norm() > 0.0 ? Vector3d(asked.normalized()) : Vector3d(at.normal.unitOrthogonal());
+      if (bound > 0.0) contact.turning = length > 0.0 ? std::min(bound / length, most) : most;
+      contact.softening = 1.0 / (1.0 + contact.turning / pair.proximal.tangential);
+    }
+    pairs_.push_back(contact);
+    pair_arrays_.add(pair, assembly_.numbering.free_nodes);
+  }
+}
+
+PairMotions Sensitivities::motions_of(const Pair& pair, const Buffer<double>& vectors) {
+  PairMotions out = PairMotions::Zero();
+  for (int c = 0; c < 4; ++c) {
+    const Vector3d d = at_node(vectors, pair.stencil.node[c]);
+    out.segment<3>(0) += pair.weights[c] * d;
+    out.segment<3>(3) += pair.along_first[c] * d;
+    out.segment<3>(6) += pair.along_second[c] * d;
+  }
+  return out;
+}
+
+bool Sensitivities::is_parameter(int parameter, const Pair& pair) const {
+  const SensitivityParameter& by = parameters_[parameter];
+  if (by.kind != SensitivityParameter::Kind::friction_of_pair) return false;
+  const std::vector<int>& sheet_of_node = newton_.pairs->near.surface.sheet_of_node;
+  const auto [low, high] =
+      std::minmax(sheet_of_node[pair.stencil.node[0]], sheet_of_node[pair.stencil.node[3]]);
+  return low == by.first && high == by.second;
+}
+
+// Sets the right-hand sides of pairs to what their laws lack at d, and `pulled_` to the change of
+// their pull on nodes.
+void Sensitivities::linearize_pairs(int parameter) {
+  const State& state = states_[parameter];
+  for (PairContact& contact : pairs_) {
+    const Pair& pair = *contact.pair;
+    const Contact& at = pair.contact;
+    const Vector3d &n = at.normal, &r = at.force;
+    const PairMotions motions = motions_of(pair, derivative_);
+    const Vector3d start = motions_of(pair, state.x).head<3>();
+    const Eigen::Vector2d places = pair.sliding * motions;
+    const Vector3d m = motions.head<3>(), rho_change = m + contact.along_now * places;
+    const Vector3d dn = in_plane(rho_change, n) / contact.distance;
+    const Vector3d way_change = rho_change - contact.turn * (start + contact.along_start * places);
+    const Vector3d slip_change = in_plane(way_change, n) - contact.way.dot(n) * dn;
+    const double opening = m.dot(n), kappa = pair.proximal.normal;
+    const double pressing = r.dot(n), normal_change = contact.change.dot(n) + r.dot(dn);
+    const Vector3d friction_change =
+        in_plane(contact.change - normal_change * n - pressing * dn, n);
+    const double own_rate = is_parameter(parameter, pair) ? 1.0 : 0.0;
+    contact.event = event_at(pressing, normal_change);
+    if (pair.row.mode == contact_stick) {
+      contact.right_side = -kappa * opening * n - pair.proximal.tangential * slip_change;
+      const Vector3d friction = at.friction();
+      const double size = friction.norm();
+      const double margin_rate =
+          own_rate * pressing + at.mu * normal_change -
+          (size > 0.0 ? friction.dot(friction_change) / size : friction_change.norm());
+      contact.event = std::min(contact.event, event_at(at.mu * pressing - size, margin_rate));
+    } else {
+      const Vector3d& t = contact.direction;
+      Vector3d lacking = friction_change;
+      lacking -= (at.mu * normal_change + own_rate * std::max(pressing, 0.0)) * t;
+      lacking += contact.turning * (slip_change - slip_change.dot(t) * t);
+      const double along = lacking.dot(t);
+      contact.right_side = -kappa * opening * n - (along + at.mu * kappa * opening) * t -
+                           contact.softening * (lacking - along * t);
+      contact.event =
+          std::min(contact.event, event_at(in_plane(contact.way, n).norm(), slip_change.dot(t)));
+    }
+    for (int c = 0; c < 4; ++c) {
+      at_node(pulled_, pair.stencil.node[c]) +=
+          pair.weights[c] * contact.change +
+          (pair.along_first[c] * places[0] + pair.along_second[c] * places[1]) * r;
+    }
+  }
+}
+
+// Takes over the changes of the pairs' forces by the solution of a round.
+void Sensitivities::update_pair_forces() {
+  const int free_nodes = assembly_.numbering.free_nodes;
+  for (PairContact& contact : pairs_) {
+    const Pair& pair = *contact.pair;
+    PairMotions motions = PairMotions::Zero();
+    for (int c = 0; c < 4; ++c) {
+      const int node = pair.stencil.node[c];
+      if (node >= free_nodes) continue;
+      const Vector3d d = at_node(solution_, node).cast<double>();
+      motions.segment<3>(0) += pair.weights[c] * d;
+      motions.segment<3>(3) += pair.along_first[c] * d;
+      motions.segment<3>(6) += pair.along_second[c] * d;
+    }
+    contact.change +=
+        contact.right_side - pair.row.stiffness * motions.head<3>() + pair.turning * motions;
+  }
+}
+
+}  // namespace sim_core
