@@ -110,7 +110,14 @@ def test_a_certificate_is_shown_beside_measurements() -> None:
         "certificate.html",
         here="certificates",
         certificate=Certificate.model_construct(
-            preset="fast", sim_core="0" * 64, passed=True, extent="full", protocols=()
+            preset="fast",
+            numbers={},
+            sim_core="0" * 64,
+            protocol_sources="0" * 64,
+            passed=True,
+            extent="full",
+            environment={},
+            protocols=(),
         ),
         digest="1" * 64,
         builds=set(),

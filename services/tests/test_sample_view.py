@@ -268,7 +268,7 @@ def test_samples_of_two_datasets_share_time_layers_curves_and_differences() -> N
         assert names == [f"{title}: {name}" for title in titles for name in of_one]
         assert [part["dashed"] for part in joined["tables"]] == [False, True]
     # What only one of them has is a plot of its own.
-    names = {of_sample["name"] for view in views for of_sample in view["plots"]}
-    assert {joined["name"] for joined in overlaid(views)} == names
+    plots = {of_sample["name"] for view in views for of_sample in view["plots"]}
+    assert {joined["name"] for joined in overlaid(views)} == plots
     forces = next(joined for joined in overlaid(views) if joined["name"] == "contact_force")
     assert "; sample 0 of cloth: contact_force: " in forces["y"]

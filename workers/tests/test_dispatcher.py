@@ -183,6 +183,8 @@ def test_a_render_process_that_is_killed_costs_one_try(
     double.offer(crash=_render(HANG), other=_render(HANG + 1))
     pid = _wait_for_pid(double, store, HANG)
     _wait_for_pid(double, store, HANG + 1)
+    # The first message of a call, which names the log, must have arrived.
+    double.until(lambda: double.started >= {"crash", "other"})
     os.kill(pid, signal.SIGKILL)
     double.until(lambda: "crash" in double.results)
     assert double.results["crash"].reason is Reason.renderer_crash

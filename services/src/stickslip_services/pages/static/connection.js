@@ -59,10 +59,15 @@ function tellLost(element, reason) {
   again.textContent = "Try again";
   again.type = "button";
   again.addEventListener("click", () => {
-    item.remove();
-    // The part of the page may have been drawn anew since.
+    // The part of the page may have been drawn anew since, a moment ago even: then htmx has not bound
+    // its elements yet, and would miss the press. The notice stays until the service has answered.
     const target = element.isConnected ? element : document.getElementById(element.id);
-    if (target) htmx.trigger(target, target.matches("form") ? "submit" : "click"); else location.reload();
+    if (!target) {
+      location.reload();
+      return;
+    }
+    htmx.process(target);
+    htmx.trigger(target, target.matches("form") ? "submit" : "click");
   });
   item.append(text, again);
   lost.replaceChildren(item);
