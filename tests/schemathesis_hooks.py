@@ -28,6 +28,10 @@ RELATIONS = (
     "must be one of ",  # the names that are built in, or of the spec's own
     "must not redefine what is built in",
     "must be [low, high]",
+    "must hold fabrics: of",
+    "must fit the density: ",
+    "must have one unit: ",
+    "which the axis draws",
     "distortion must be 0",
     "distortion must move places",
     "camera_matrix must be",
