@@ -303,7 +303,8 @@ class Cloth:
             begins=True,
         )
         # The derivatives of a state that a user gives are zero until the user gives them, too.
-        self._solver.follow([parameter.as_tuple() for parameter in self._parameters])
+        if self._parameters:
+            self.follow(self._parameters)
 
     def hold(self, vertices: ArrayLike, bodies: Sequence[Body] = ()) -> None:
         """Prescribe the positions of these vertices (K,) from now on, and let go of all others.
@@ -423,7 +424,8 @@ class Cloth:
         while self.time < end and self.spent <= 1.0:
             # `positions_at` interpolates between the two ends of this step.
             self._before = self.time, self.positions, self.velocities
-            self._before_sensitivities = self.sensitivities, self.velocity_sensitivities
+            if self._parameters:
+                self._before_sensitivities = self.sensitivities, self.velocity_sensitivities
             self.time, report = self._solver.advance(self.time, event, drive, track, may_fail())
             self.total.add(report)
             self.history.add(self.time - self._before[0], report)
