@@ -70,8 +70,7 @@ Sensitivities::NodeContact Sensitivities::contact_of(int node, const Step& step)
         [&](int b) -> Vector3d { return p - carried(step.at_start[b], step.at_end[b], before); });
   }
   const double bound = contact.friction.mu * contact.bearing_force;
-  const double most = turning_max * at.stiffness, length = at.slip.norm();
-  if (bound > 0.0) contact.turning = length > 0.0 ? std::min(bound / length, most) : most;
+  contact.turning = turning_of(bound, at.slip.norm(), at.stiffness);
   return contact;
 }
 

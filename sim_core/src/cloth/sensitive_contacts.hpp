@@ -2,6 +2,7 @@
 #pragma once
 
 #include <Eigen/Core>
+#include <algorithm>
 #include <cmath>
 #include <limits>
 
@@ -21,6 +22,14 @@ inline double event_at(double margin, double rate) {
 
 inline Eigen::Vector3d in_plane(const Eigen::Vector3d& vector, const Eigen::Vector3d& normal) {
   return vector - vector.dot(normal) * normal;
+}
+
+// b_s k/(1 - b_s) of a contact that slides by `length` [m], whose friction is `bound` [N] and whose
+// law has the stiffness k [N/m]: the stiffness against a turn of friction, N/m.
+inline double turning_of(double bound, double length, double stiffness) {
+  const double most = turning_max * stiffness;
+  if (!(bound > 0.0)) return 0.0;
+  return length > 0.0 ? std::min(bound / length, most) : most;
 }
 
 }  // namespace sim_core

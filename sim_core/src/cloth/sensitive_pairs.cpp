@@ -33,10 +33,9 @@ void Sensitivities::classify_pairs(const Step& step) {
       const Vector3d slip = in_plane(contact.way, at.normal);
       const Vector3d asked = at.friction() - at.stiffness * slip;
       const double bound = at.mu * std::max(at.normal_force(), 0.0);
-      const double most = turning_max * at.stiffness, length = slip.norm();
       contact.direction =
           asked.norm() > 0.0 ? Vector3d(asked.normalized()) : Vector3d(at.normal.unitOrthogonal());
-      if (bound > 0.0) contact.turning = length > 0.0 ? std::min(bound / length, most) : most;
+      contact.turning = turning_of(bound, slip.norm(), at.stiffness);
       contact.softening = 1.0 / (1.0 + contact.turning / pair.proximal.tangential);
     }
     pairs_.push_back(contact);
