@@ -268,3 +268,16 @@ def test_parameters_that_are_not_there_are_refused() -> None:
     cloth.follow([friction(1)])
     with pytest.raises(ValueError, match="one of 1 bodies, got 1"):
         cloth.step(0.01, bodies=[plane(0.3, origin=(0.0, 0.0, -1.0))])
+
+
+@pytest.mark.parametrize(
+    ("rates", "message"),
+    [
+        (DriveRates(held=np.zeros((2, 3))), r"held must be empty or \(10, 3\), got \(2, 3\)"),
+        (DriveRates(gravity=np.zeros((3, 3))), r"gravity must be empty or \(55, 3\)"),
+        (DriveRates(bodies=[(np.zeros(3), np.zeros(3))]), "bodies must be none or all 0, got 1"),
+    ],
+)
+def test_rates_of_other_things_are_refused(rates: DriveRates, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Strip(parameter=drive(lambda _time: rates)).run(0.0, follow=True)

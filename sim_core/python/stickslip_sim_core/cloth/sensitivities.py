@@ -54,6 +54,21 @@ class DriveRates:
     gravity: Floats = field(default_factory=_no_points)
     bodies: Sequence[tuple[Floats, Floats]] = ()
 
+    def check(self, held: int, vertices: int, bodies: int) -> None:
+        """Check that each array is empty or has a row for each thing.
+
+        Raises:
+            ValueError: An array has another length.
+        """
+        sizes = (("held", self.held, held), ("gravity", self.gravity, vertices))
+        for name, points, count in sizes:
+            if np.shape(points) not in ((0, 3), (count, 3)):
+                raise ValueError(
+                    f"rates: {name} must be empty or ({count}, 3), got {np.shape(points)}"
+                )
+        if len(self.bodies) not in (0, bodies):
+            raise ValueError(f"rates: bodies must be none or all {bodies}, got {len(self.bodies)}")
+
     def as_tuple(self) -> RatesTuple:
         return self.held, self.gravity, list(self.bodies)
 
@@ -73,9 +88,9 @@ class Parameter:
     def as_tuple(self) -> tuple[int, int, int]:
         return _NUMBERS[self.kind], self.first, self.second
 
-    def rates_at(self, time: float) -> RatesTuple:
-        """Return what drives the cloth depends on the parameter at a time [s]."""
-        return (self.rates(time) if self.rates else DriveRates()).as_tuple()
+    def rates_at(self, time: float) -> DriveRates:
+        """Return how what drives the cloth depends on the parameter at a time [s]."""
+        return self.rates(time) if self.rates else DriveRates()
 
 
 def friction(body: int, sheet: int | None = None) -> Parameter:

@@ -348,7 +348,7 @@ class Cloth:
             self._surfaces_at(self.time + dt),
             [body.as_tuple() for body in bodies],
             damping,
-            self._rates_at(self.time + dt),
+            self._rates_at(self.time + dt, len(bodies)),
         )
         self.time += dt
         self.total.add(report)
@@ -403,7 +403,14 @@ class Cloth:
                 [body.as_tuple() for body in bodies],
             )
             surfaces = self._surfaces_at(time)
-            return self.gravity, ends, surfaces, tuples, damping(time), self._rates_at(time)
+            return (
+                self.gravity,
+                ends,
+                surfaces,
+                tuples,
+                damping(time),
+                self._rates_at(time, len(tuples)),
+            )
 
         # The solver calls `track` for many times within a step, to see whether the motion is even.
         def track(times: Sequence[float]) -> tuple[Floats, Floats]:
@@ -550,8 +557,12 @@ class Cloth:
         now = self.sensitivities, self.velocity_sensitivities
         return self._between(time, self._before_sensitivities, now, straight=straight)
 
-    def _rates_at(self, time: float) -> list[RatesTuple]:
-        return [parameter.rates_at(time) for parameter in self._parameters]
+    def _rates_at(self, time: float, bodies: int) -> list[RatesTuple]:
+        rates = [parameter.rates_at(time) for parameter in self._parameters]
+        # The solver reads a row for each thing, and a missing one would be memory of others.
+        for by_parameter in rates:
+            by_parameter.check(len(self.held), len(self.mesh.rest), bodies)
+        return [by_parameter.as_tuple() for by_parameter in rates]
 
     @property
     def momentum_rate(self) -> Floats:
