@@ -56,7 +56,8 @@ PairMotions Sensitivities::motions_of(const Pair& pair, const Buffer<double>& ve
 
 bool Sensitivities::is_parameter(int parameter, const Pair& pair) const {
   const SensitivityParameter& by = parameters_[parameter];
-  if (by.kind != SensitivityParameter::Kind::friction_of_pair) return false;
+  const Cone cone = pair.cone.value_or(Cone::sliding);
+  if (!by.is_friction_of_pair() || !by.is_of(cone)) return false;
   const std::vector<int>& sheet_of_node = newton_.pairs->near.surface.sheet_of_node;
   const auto [low, high] =
       std::minmax(sheet_of_node[pair.stencil.node[0]], sheet_of_node[pair.stencil.node[3]]);

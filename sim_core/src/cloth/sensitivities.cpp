@@ -84,7 +84,7 @@ void Sensitivities::advance(const Step& step) {
   }
   bodies_ = static_cast<int>(step.at_end.size());
   for (const SensitivityParameter& by : parameters_) {
-    if (by.kind == SensitivityParameter::Kind::friction_of_body && by.first >= bodies_)
+    if (by.is_friction_of_body() && by.first >= bodies_)
       refuse(text("parameter: friction must be of one of ", bodies_, " bodies, got ", by.first));
   }
   classify_nodes(step);
@@ -118,6 +118,8 @@ void Sensitivities::by_parameter(int parameter, const Step& step) {
     }
     case Kind::friction_of_body:
     case Kind::friction_of_pair:
+    case Kind::static_friction_of_body:
+    case Kind::static_friction_of_pair:
     case Kind::drive:  // contacts, and the prescribed points and accelerations, bring these in
       return;
   }

@@ -40,9 +40,26 @@ struct SensitivityParameter {
     stretching = 3,        // logarithm of a factor of the stiffness of all fabrics
     density = 4,           // logarithm of a factor of the density of all fabrics
     drive = 5,             // what moves held vertices, bodies and gravity: see DriveRates
+    // The static coefficients of the first two, where they differ from the kinetic ones, which the
+    // first two are then. Only what holds depends on them: no position does until it slips.
+    static_friction_of_body = 6,
+    static_friction_of_pair = 7,
   };
   Kind kind;
   int first = -1, second = -1;
+
+  bool is_friction_of_body() const {
+    return kind == Kind::friction_of_body || kind == Kind::static_friction_of_body;
+  }
+  bool is_friction_of_pair() const {
+    return kind == Kind::friction_of_pair || kind == Kind::static_friction_of_pair;
+  }
+  // Whether a contact with this cone bears friction by the parameter.
+  bool is_of(Cone cone) const {
+    const bool is_static =
+        kind == Kind::static_friction_of_body || kind == Kind::static_friction_of_pair;
+    return is_static == (cone == Cone::resting);
+  }
 };
 
 // Derivative of the pose of a body by a parameter.

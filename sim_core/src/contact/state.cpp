@@ -82,7 +82,8 @@ ContactState::ContactState(int free_nodes)
       coupling(free_nodes, 0.0f),
       turning(free_nodes, 0.0f),
       force(4 * free_nodes + 64, 0.0f),
-      correction(4 * free_nodes + 64, 0.0f) {}
+      correction(4 * free_nodes + 64, 0.0f),
+      cone(free_nodes, Cone::sliding) {}
 
 ContactRows ContactState::rows() const {
   return {mode.data(), normal.data(), direction.data(), coupling.data(), turning.data()};
@@ -176,6 +177,7 @@ ForceNorms ContactState::classify_contacts(const Buffer<double>& x, const Buffer
     }
     const bool slipped = mode[i] == contact_slip && touched[i] == on.body;
     touched[i] = on.body;
+    if (resting_.applies) choose_cone(i, on, x, start, at_start, at_end);
     const Contact contact = contact_at(i, on, x, start, residual, at_start, at_end);
     const LawResponse law = coulomb_law(contact);
     const bool reversed = slipped && law.mode == contact_slip &&
@@ -188,14 +190,81 @@ ForceNorms ContactState::classify_contacts(const Buffer<double>& x, const Buffer
   return norms;
 }
 
+void ContactState::begin(const Buffer<double>& expected, const std::vector<Body>& at_end) {
+  const auto differs = [](const Body& body) {
+    return !body.mu_static.empty() && body.mu_static != body.mu;
+  };
+  resting_.applies =
+      std::any_of(at_end.begin(), at_end.end(), differs) || (surfaces && surfaces->has_static());
+  if (!resting_.applies) return;
+  resting_.expected = &expected;
+  resting_.of.assign(mode.size(), -1);
+  resting_.onward.assign(mode.size(), 0.0);
+  std::fill(cone.begin(), cone.end(), Cone::sliding);
+}
+
+bool ContactState::has_static(int node, const BodyContact& on,
+                              const std::vector<Body>& at_end) const {
+  const auto mu_of = [&](Cone of) -> double {
+    if (on.body >= static_cast<int>(at_end.size())) return surfaces->mu(node, of);
+    return on.average([&](int b) { return at_end[b].mu_of(sheet[node], of); });
+  };
+  return mu_of(Cone::resting) > mu_of(Cone::sliding);
+}
+
+Vector3d ContactState::slip_to(int node, const BodyContact& on, const Vector3d& before,
+                               const Vector3d& p, const std::vector<Body>& at_start,
+                               const std::vector<Body>& at_end) const {
+  if (on.body < static_cast<int>(at_end.size())) return slip(on, before, p, at_start, at_end);
+  const Vector3d u = surfaces->slip(node, before, p);
+  return u - u.dot(on.gap.normal) * on.gap.normal;
+}
+
+void ContactState::choose_cone(int node, const BodyContact& on, const Buffer<double>& x,
+                               const Buffer<double>& start, const std::vector<Body>& at_start,
+                               const std::vector<Body>& at_end) {
+  const Vector3d before = at_node(start, node);
+  const Vector3d way =
+      slip_to(node, on, before, at_node(*resting_.expected, node), at_start, at_end);
+  if (resting_.of[node] != on.body) {
+    resting_.of[node] = on.body;
+    const bool touched_it = !resting_.mode.empty() && resting_.mode[node] != contact_open &&
+                            resting_.touched[node] == on.body;
+    cone[node] = touched_it ? cone_after(resting_.mode[node]) : cone_of_new(way);
+    // With one coefficient there is one cone.
+    if (!has_static(node, on, at_end)) cone[node] = Cone::released;
+  }
+  resting_.onward[node] = slip_to(node, on, before, at_node(x, node), at_start, at_end).dot(way);
+}
+
+bool ContactState::switch_cones() {
+  bool any = false;
+  if (!resting_.applies) return any;
+  for (std::size_t i = 0; i < mode.size(); ++i) {
+    const Cone next = next_cone(cone[i], mode[i], resting_.onward[i]);
+    any = any || next != cone[i];
+    cone[i] = next;
+  }
+  return any;
+}
+
 void ContactState::store_history(double dt) {
   history_ = {mode, touched, direction, turning, dt};
+  if (resting_.applies) {
+    resting_.mode = mode;
+    resting_.touched = touched;
+  }
   if (surfaces) surfaces->store_history(mode);
 }
 
 void ContactState::clear_history() {
   history_.dt = 0.0;
   if (surfaces) surfaces->restart();
+}
+
+void ContactState::restart() {
+  clear_history();
+  resting_.mode.clear();
 }
 
 bool ContactState::warm_start(const Buffer<double>& x, const Buffer<double>& start,
@@ -214,6 +283,7 @@ bool ContactState::warm_start(const Buffer<double>& x, const Buffer<double>& sta
       if (!one) continue;
       on = {{one->gap, one->normal}, body};
     }
+    if (resting_.applies) choose_cone(node, on, x, start, at_start, at_end);
     const Contact contact = contact_at(node, on, x, start, residual, at_start, at_end);
     touched[i] = body;
     at_node(normal, node) = on.gap.normal.cast<float>();
@@ -243,9 +313,7 @@ Contact ContactState::contact_at(int node, const BodyContact& on, const Buffer<d
   const Vector3d before = at_node(start, node);
   const Vector3d p = at_node(x, node);
   const Vector3d& n = on.gap.normal;
-  const bool on_surface = on.body >= static_cast<int>(at_end.size());
-  Vector3d u = on_surface ? surfaces->slip(node, before, p) : slip(on, before, p, at_start, at_end);
-  if (on_surface) u -= u.dot(n) * n;
+  const Vector3d u = slip_to(node, on, before, p, at_start, at_end);
   const Vector3d pressing = press(on, node);
   const Vector3d force = at_node(residual, node) - pressing;
   Contact out{on.gap.distance, n, u, force, 0.0, stiffness[node], pressing.norm()};
@@ -261,8 +329,9 @@ FrictionCoefficient ContactState::mu_at(int node, const BodyContact& on, const V
                                         const Vector3d& friction,
                                         const std::vector<Body>& at_end) const {
   const bool on_surface = on.body >= static_cast<int>(at_end.size());
-  const double mu = on_surface ? surfaces->mu(node)
-                               : on.average([&](int b) { return at_end[b].mu_of(sheet[node]); });
+  const double mu =
+      on_surface ? surfaces->mu(node, cone[node])
+                 : on.average([&](int b) { return at_end[b].mu_of(sheet[node], cone[node]); });
   const bool turns = on_surface || (at_end[on.body].shape != Body::plane && on.neighbours[0] < 0 &&
                                     on.opposite < 0);
   const double size = friction.norm();

@@ -226,6 +226,8 @@ class TestPresets:
         always = {
             "fall",
             "slide-to-rest",
+            "static-onset",
+            "kinetic-slide",
             "impact",
             "gripper",
             "stick-slip",

@@ -16,7 +16,14 @@ import numpy as np
 from stickslip_sim_core.arrays import Floats
 
 Kind: TypeAlias = Literal[
-    "friction_of_body", "friction_of_pair", "bending", "stretching", "density", "drive"
+    "friction_of_body",
+    "friction_of_pair",
+    "bending",
+    "stretching",
+    "density",
+    "drive",
+    "static_friction_of_body",
+    "static_friction_of_pair",
 ]
 
 # The numbers of SensitivityParameter::Kind.
@@ -27,6 +34,8 @@ _NUMBERS: dict[Kind, int] = {
     "stretching": 3,
     "density": 4,
     "drive": 5,
+    "static_friction_of_body": 6,
+    "static_friction_of_pair": 7,
 }
 
 RatesTuple: TypeAlias = tuple[Floats, Floats, list[tuple[Floats, Floats]]]
@@ -93,17 +102,24 @@ class Parameter:
         return self.rates(time) if self.rates else DriveRates()
 
 
-def friction(body: int, sheet: int | None = None) -> Parameter:
-    """Return the coefficient of friction of a body, with one sheet or with all."""
-    return Parameter("friction_of_body", body, -1 if sheet is None else sheet)
+def friction(body: int, sheet: int | None = None, *, static: bool = False) -> Parameter:
+    """Return the coefficient of friction of a body, with one sheet or with all.
+
+    It is the kinetic coefficient. With `static` it is the static one of a body that has both: only
+    what holds depends on it, so positions do not change by it to first order, and
+    `Cloth.nearest_events` says which change sets something off.
+    """
+    kind: Kind = "static_friction_of_body" if static else "friction_of_body"
+    return Parameter(kind, body, -1 if sheet is None else sheet)
 
 
-def pair_friction(first: int, second: int) -> Parameter:
+def pair_friction(first: int, second: int, *, static: bool = False) -> Parameter:
     """Return the coefficient of friction of two sheets, of a sheet with itself or with a surface.
 
-    Surfaces are counted after the sheets.
+    Surfaces are counted after the sheets. For `static`, see `friction`.
     """
-    return Parameter("friction_of_pair", min(first, second), max(first, second))
+    kind: Kind = "static_friction_of_pair" if static else "friction_of_pair"
+    return Parameter(kind, min(first, second), max(first, second))
 
 
 def fabric_factor(kind: Literal["bending", "stretching", "density"]) -> Parameter:

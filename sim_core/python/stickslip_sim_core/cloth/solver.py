@@ -119,7 +119,7 @@ class Cloth:
         # The C++ solver has one list of vertices for all surfaces, one surface after the other.
         self._surface_sizes = sizes = [len(surface.at(self.time)) for surface in self.surfaces]
         corners = [np.asarray(surface.triangles) for surface in self.surfaces]
-        mu, thickness = self._touch(sheets)
+        mu, mu_static, thickness = self._touch(sheets)
         edge_fraction, second_fraction = BEARING[self_contact.bearing if self_contact else "all"]
         # The lightest fabric gives the smallest unit, so no sheet converges too early.
         patch_weight = (
@@ -156,6 +156,7 @@ class Cloth:
             surface_of_vertex=np.repeat(np.arange(len(sizes)), sizes).tolist(),
             surface_positions=self._surfaces_at(self.time),
             crease=[surface.crease for surface in self.surfaces],
+            mu_static=mu_static,
         )
         self._solver = self._make(held=self.held.tolist())
         # Time, positions and velocities before the last step. The time inf stands for no step yet.
@@ -175,13 +176,18 @@ class Cloth:
         self._spent = 0.0
         self.gravity = np.tile([0.0, 0.0, -GRAVITY], (len(mesh.rest), 1))
 
-    def _touch(self, sheets: int) -> tuple[Floats, Floats]:
-        """Return friction between sheets and surfaces (-1: no contact), and thicknesses."""
+    def _touch(self, sheets: int) -> tuple[Floats, Floats, Floats]:
+        """Return kinetic and static friction of sheets and surfaces, and thicknesses.
+
+        Friction of -1 stands for no contact.
+        """
         # Surfaces come after the sheets. Two surfaces have no contact: both are prescribed.
         mu = np.full((sheets + len(self.surfaces),) * 2, -1.0)
+        mu_static = mu.copy()
         thickness = np.full(sheets, THICKNESS)
         if self.self_contact:
-            mu[:sheets, :sheets], thickness = self.self_contact.of_sheets(sheets)
+            of_sheets = self.self_contact.of_sheets(sheets)
+            mu[:sheets, :sheets], mu_static[:sheets, :sheets], thickness = of_sheets
         for column, surface in enumerate(self.surfaces, start=sheets):
             own = np.asarray(surface.mu, float)
             # A surface does not have the number of sheets, so it could not check its friction.
@@ -190,7 +196,10 @@ class Cloth:
                     f"mu: of a surface must be one or of {sheets} sheets, got {own.tolist()}"
                 )
             mu[:sheets, column] = mu[column, :sheets] = own
-        return mu, np.append(thickness, [surface.thickness for surface in self.surfaces])
+            resting = own if surface.mu_static is None else np.asarray(surface.mu_static, float)
+            mu_static[:sheets, column] = mu_static[column, :sheets] = resting
+        skins = [surface.thickness for surface in self.surfaces]
+        return mu, mu_static, np.append(thickness, skins)
 
     def _surfaces_at(self, time: float) -> Floats:
         found = [surface.at(time) for surface in self.surfaces]

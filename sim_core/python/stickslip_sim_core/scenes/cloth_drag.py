@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stickslip_sim_core.arrays import Floats, check_range
 from stickslip_sim_core.cloth import meshes
-from stickslip_sim_core.cloth.contact import SELF_FRICTION, Body, SelfContact, plane
+from stickslip_sim_core.cloth.contact import SELF_FRICTION, Body, Friction, SelfContact, plane
 from stickslip_sim_core.cloth.fabrics import Fabric, fabric
 from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
 from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
@@ -106,7 +106,7 @@ def hang(mesh: meshes.Mesh, fabric: Fabric, *, seed: int, kernel: str | None = N
 
 def scene(
     material: str | Fabric,
-    mu: float,
+    mu: float | Friction,
     *,
     self_friction: float | None = SELF_FRICTION,
     preset: str | SolverSettings = "certified",
@@ -124,7 +124,8 @@ def scene(
 
     Args:
         material: One of `fabric_names()`, or a fabric. Its warp runs along the held edge.
-        mu: Coefficient of friction between cloth and floor, 0 ... 10.
+        mu: Coefficient of friction between cloth and floor, 0 ... 10; or that of what slides and
+            that of what rests.
         self_friction: Coefficient of friction of the cloth with itself, 0 ... 10. None turns
             self-contact off.
         preset: Solver settings, or their name.
@@ -141,6 +142,7 @@ def scene(
         check_range("mesh", mesh, 5, np.inf)
         # `mesh` counts vertices, and a grid takes cells.
         mesh = meshes.grid(SIDE, SIDE, mesh - 1, mesh - 1)
+    floor = replace(plane(mu[0]), mu_static=mu[1]) if isinstance(mu, Friction) else plane(mu)
     made = fabric(material) if isinstance(material, str) else material
     cloth = hang(mesh, made, seed=seed, kernel=kernel)
     return Scene(
@@ -151,8 +153,8 @@ def scene(
         preset=replace(preset_named(preset), second_order=False),
         start=cloth.positions,
         holders=[Holder(cloth.held, holder_pose)],
-        motion=motion_of(cloth, mu),
-        poses=lambda times: np.broadcast_to(plane(mu).pose, (len(times), 1, 3, 4)),
+        motion=motion_of(cloth, floor),
+        poses=lambda times: np.broadcast_to(floor.pose, (len(times), 1, 3, 4)),
         self_contact=None if self_friction is None else SelfContact(self_friction),
         frames=frames,
         frame_rate=FRAME_RATE,
@@ -167,17 +169,17 @@ def scene(
 KIND = cloth_kind(scene)
 
 
-def motion_of(hung: Hung, mu: float) -> Callable[[float], tuple[Floats, Sequence[Body]]]:
-    """Return the motion over a floor of friction mu.
+def motion_of(hung: Hung, floor: Body) -> Callable[[float], tuple[Floats, Sequence[Body]]]:
+    """Return the motion over a floor.
 
     Gravity is upright from one second after the drop on.
     """
-    floor = [plane(mu)]
+    bodies = [floor]
 
     def motion(time: float) -> tuple[Floats, Sequence[Body]]:
         # The tilt fades out within a second, so that gravity does not jump.
         upright = min(max(time - duration_of(DROP), 0.0), 1.0)
-        return np.array([0.0, 0.0, -GRAVITY]) + hung.tilt * GRAVITY * (1.0 - upright), floor
+        return np.array([0.0, 0.0, -GRAVITY]) + hung.tilt * GRAVITY * (1.0 - upright), bodies
 
     return motion
 

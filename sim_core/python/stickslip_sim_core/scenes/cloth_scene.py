@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from stickslip_sim_core._sim_core import sheet_count
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
-from stickslip_sim_core.cloth.contact import SelfContact
+from stickslip_sim_core.cloth.contact import Friction, SelfContact
 from stickslip_sim_core.cloth.presets import preset_named
 from stickslip_sim_core.cloth.solver import Cloth
 from stickslip_sim_core.scenes.holders import Holder
@@ -21,6 +21,10 @@ from stickslip_sim_core.scenes.scene import ClothRun, Scene, cloth_kernel, fabri
 
 UPRIGHT = 1.0
 """Time in which gravity turns upright over a hung sheet after its bias ends [s]."""
+
+
+FrictionOfPairs = Mapping[tuple[str, str], Friction]
+"""Friction by the names of a sheet and of another sheet or a body."""
 
 
 def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Scene:
@@ -47,9 +51,9 @@ def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Sc
     Raises:
         ValueError: A value breaks its rule. The message begins with the place of the value.
     """
-    mu = _friction(document)
+    friction = _friction(document)
     sheets = _sheets(document, seed, kernel)
-    things = _things(document, sheets, mu)
+    things = _things(document, sheets, friction)
     held = _held(sheets)
     gravity = _Gravity(document, sheets, seed)
     # Surfaces move as `Surface` objects, so `motion` and `poses` have rigid bodies only.
@@ -66,7 +70,7 @@ def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Sc
             np.reshape([pose(times) for pose in rigid_poses], (-1, len(times), 3, 4)), 0, 1
         ),
         holders=held.holders,
-        self_contact=_touch(document, sheets, mu),
+        self_contact=_touch(document, sheets, friction),
         surfaces=[body.surface for body in things if body.surface is not None],
         damping=lambda time: calm["rate"] if calm is not None and time <= calm["until"] else 0.0,
         frames=_frames(document),
@@ -107,14 +111,12 @@ def _sheets(document: Document, seed: int, kernel: str | None) -> list[Sheet]:
     return sheets
 
 
-def _things(
-    document: Document, sheets: Sequence[Sheet], mu: Mapping[tuple[str, str], float]
-) -> list[Thing]:
+def _things(document: Document, sheets: Sequence[Sheet], friction: FrictionOfPairs) -> list[Thing]:
     """Return the bodies in the order of their names, with their friction by sheet."""
     cell = max(part.mesh.spacing for part in sheets)
     things = []
     for name, body in sorted(document["bodies"].items()):
-        by_sheet = [mu[part.name, name] for part in sheets]
+        by_sheet = [friction[part.name, name] for part in sheets]
         things.append(thing(name, body, by_sheet, cell=cell))
     return things
 
@@ -190,19 +192,27 @@ def _hanging_fault(sheets: Sequence[Sheet]) -> str:
     return ""
 
 
-def _friction(document: Document) -> dict[tuple[str, str], float]:
-    """Return the coefficient of friction of each sheet with each sheet and body."""
-    pairs = {frozenset(pair["between"]): pair["mu"] for pair in document["friction"]}
-    default: float = document["default_friction"] or 0.0
-    mu = {}
+def _friction(document: Document) -> dict[tuple[str, str], Friction]:
+    """Return the friction of each sheet with each sheet and body."""
+    pairs = {frozenset(pair["between"]): _friction_of(pair) for pair in document["friction"]}
+    default = float(document["default_friction"] or 0.0)
+    friction = {}
     for names in product(document["sheets"], (*document["sheets"], *document["bodies"])):
         # A pair has no order. A sheet with itself is a set of a single name.
-        mu[names] = float(pairs.get(frozenset(names), default))
-    return mu
+        friction[names] = pairs.get(frozenset(names), Friction(default, default))
+    return friction
+
+
+def _friction_of(pair: Document) -> Friction:
+    """Return the friction of a pair of the document, which has `mu`, or both coefficients."""
+    mu = pair.get("mu")
+    if mu is not None:
+        return Friction(float(mu), float(mu))
+    return Friction(float(pair["kinetic"]), float(pair["static"]))
 
 
 def _touch(
-    document: Document, sheets: Sequence[Sheet], mu: Mapping[tuple[str, str], float]
+    document: Document, sheets: Sequence[Sheet], friction: FrictionOfPairs
 ) -> SelfContact | None:
     """Return the contact of cloth with cloth, or None if the only sheet has no self-contact."""
     names = [part.name for part in sheets]
@@ -215,10 +225,13 @@ def _touch(
         )
     if without:
         return None
-    friction = []
-    for name in names:
-        friction.append([mu[name, other] for other in names])
-    return SelfContact(friction, [part.thickness for part in sheets], document["bearing"])
+    by_names = np.array([[friction[name, other] for other in names] for name in names], float)
+    return SelfContact(
+        by_names[..., 0],
+        [part.thickness for part in sheets],
+        document["bearing"],
+        mu_static=by_names[..., 1],
+    )
 
 
 class _Gravity:

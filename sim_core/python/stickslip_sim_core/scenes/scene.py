@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from stickslip_sim_core._sim_core import build_info
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import checks
-from stickslip_sim_core.cloth.contact import Body, SelfContact, Surface
+from stickslip_sim_core.cloth.contact import Body, Friction, SelfContact, Surface
 from stickslip_sim_core.cloth.fabrics import Fabric, custom_fabric, fabric
 from stickslip_sim_core.cloth.meshes import Mesh
 from stickslip_sim_core.cloth.presets import SolverSettings
@@ -351,10 +351,16 @@ def cloth_kind(scene: Callable[..., Scene]) -> Kind:
 
 
 def _of_materials(physics: Mapping[str, Any]) -> dict[str, Any]:
-    """Return physics with a fabric instead of its name, custom numbers and factors."""
+    """Return physics with a fabric instead of its name, custom numbers and factors.
+
+    Friction is a pair where what rests holds more than what slides.
+    """
     known = dict(physics)
     factors = {name: known.pop(name, 1.0) for name in ("density", "bending", "stretching")}
     name = known.pop("material")
     numbers = known.pop("fabric", None)
     made = fabric(name) if numbers is None else custom_fabric(name, **numbers)
+    ratio = known.pop("static_ratio", 1.0)
+    if ratio != 1.0:
+        known["mu"] = Friction(known["mu"], ratio * known["mu"])
     return {**known, "material": made.scaled(**factors)}
