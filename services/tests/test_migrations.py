@@ -51,7 +51,7 @@ def test_indexes_are_partial_where_the_tables_say_so(
                 [_plain(row.sql) for row in rows if "alembic_version" not in row.name]
             )
     assert statements[0] == statements[1]
-    assert sum("WHERE" in sql for sql in statements[0]) == 6
+    assert sum("WHERE" in sql for sql in statements[0]) == 7
 
 
 def test_a_migration_that_fails_leaves_nothing(empty_database: Callable[[], Database]) -> None:

@@ -23,11 +23,12 @@ from hypothesis.stateful import (
 from sqlalchemy import select
 from stickslip_schemas.base import JobState, Reason
 from stickslip_schemas.documents.worker_api import Lease
-from stickslip_services.database.tables import job_tasks, jobs, tasks
+from stickslip_services.database.tables import job_tasks, jobs, ready_tasks, tasks
 from stickslip_services.errors import ConflictError
 from stickslip_services.queue.background import start, sweep
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.control import cancel_job, pause_job, prioritise_job, resume_job
+from stickslip_services.queue.leaving import QueueCleaner
 from stickslip_services.queue.planner import Planner
 from stickslip_services.queue.rows import SCHEDULABLE
 from stickslip_services.queue.submit import submit_job
@@ -49,6 +50,9 @@ SPECS = (
     ),  # too many samples to be planned at once; shares tasks with the first two
 )
 PLAN_SAMPLES = 4
+
+CLEANED_ROWS = 2
+"""Rows of a piece that is removed from the queue."""
 
 HOW = ("well", "well", "well", "crashed", "crashed", "broken", "lost", "released")
 """How a task ends, the likely ways more often."""
@@ -83,6 +87,7 @@ class QueueMachine(RuleBasedStateMachine):
         self.context = Context.open(self.settings, self.clock)
         start(self.context)
         self.planner = Planner(self.context)
+        self.cleaner = QueueCleaner(self.context, piece=CLEANED_ROWS)
         self.workers: dict[str, PretendWorker] = {}
         self.holders: dict[str, tuple[str, int, float]] = {}  # task -> worker id, token, expiry
         self.seen: dict[str, float] = {}  # worker id -> when it beat or reported last
@@ -247,11 +252,23 @@ class QueueMachine(RuleBasedStateMachine):
             assert unsettled(connection) == []
 
     @rule()
+    def clean(self) -> None:
+        """Remove a piece of an ended job from the queue."""
+        leaving, rows = self._leaving_jobs(), self._queued_rows()
+        assert self.cleaner.step() == bool(leaving)
+        removed = rows - self._queued_rows()
+        assert {job for job, _ in removed} <= leaving
+        has_left = leaving - self._leaving_jobs()
+        assert len(removed) in ((1, CLEANED_ROWS) if leaving and not has_left else (0,))
+        assert has_left.isdisjoint(job for job, _ in self._queued_rows())
+
+    @rule()
     def restart(self) -> None:
         self.context.close()
         self.context = Context.open(self.settings, self.clock)
         start(self.context)
         self.planner = Planner(self.context)
+        self.cleaner = QueueCleaner(self.context, piece=CLEANED_ROWS)
         for worker in self.workers.values():
             worker.api = DirectApi(self.context)
         expiry = self.clock() + self.settings.lease_seconds
@@ -298,6 +315,9 @@ class QueueMachine(RuleBasedStateMachine):
         for job in list_jobs(self.context):
             assert not job.state.is_open, f"{job.id} is {job.state}"
         self.tables_agree()
+        while self.cleaner.step():
+            pass
+        assert not self._queued_rows(), "the queue of ended jobs is empty"
         self.context.close()
         self.directory.cleanup()
 
@@ -315,6 +335,16 @@ class QueueMachine(RuleBasedStateMachine):
                 .limit(1)
             )
         return job is not None
+
+    def _leaving_jobs(self) -> set[int]:
+        with self.context.database.read() as connection:
+            return set(connection.scalars(select(jobs.c.seq).where(jobs.c.leaves_queue)))
+
+    def _queued_rows(self) -> set[tuple[int, int]]:
+        """Return the rows of the queue: job and task."""
+        with self.context.database.read() as connection:
+            rows = connection.execute(select(ready_tasks.c.job, ready_tasks.c.task))
+            return {(row.job, row.task) for row in rows}
 
     def _holds(self, worker: PretendWorker, lease: Lease) -> bool:
         """Return whether nobody has taken the task back: a late sign of life is welcome."""

@@ -7,8 +7,14 @@ import pytest
 from sqlalchemy import bindparam, insert, select, update
 from sqlalchemy.exc import IntegrityError, OperationalError, ProgrammingError
 from stickslip_services.database.database import Database
-from stickslip_services.database.statements import BATCH, RowQuery, Statement, ValueQuery
-from stickslip_services.database.tables import metadata, previews
+from stickslip_services.database.statements import (
+    BATCH,
+    RowQuery,
+    Statement,
+    ValueQuery,
+    insert_rows,
+)
+from stickslip_services.database.tables import metadata, previews, tasks, uploads
 
 
 class Preview(NamedTuple):
@@ -95,3 +101,38 @@ def test_errors_are_those_of_sqlalchemy(filled: Database) -> None:
         Statement(insert(previews)).run(connection, {"task": 1, "digest": "twice"})
     with filled.read() as connection, pytest.raises((OperationalError, ProgrammingError)):
         ValueQuery[int]("SELECT nothing FROM nowhere").values(connection)
+
+
+def test_many_rows_are_inserted_with_any_characters(filled: Database) -> None:
+    """PostgreSQL gets them by COPY, which has separators and a mark for NULL in its text."""
+    texts = ["", "\\N", "tab\there", "line\nbreak\r", "back\\slash", "na\u00efve \U0001f9f5", "'"]
+    rows = [(bytes([number, 0, 92, 10]), text, None) for number, text in enumerate(texts)]
+    columns = ("project", "digest")
+    with filled.write() as connection:
+        insert_rows(connection, uploads, columns, [])
+        insert_rows(connection, uploads, columns, [(text, "x") for text in texts])
+        assert set(ValueQuery[str]("SELECT project FROM uploads").values(connection)) == {*texts}
+
+        names = ("seq", "key", "reason", "preview", "expires_at")
+        fixed = ("stage", "kind", "build", "payload", "message", "state")
+        insert_rows(
+            connection,
+            tasks,
+            (*names, *fixed, "payload_digest", "waiting_on"),
+            [
+                (number, key, reason, bool(number % 2), 0.1, *[text] * len(fixed), 2**62, 1)
+                for number, (key, text, reason) in enumerate(rows)
+            ],
+        )
+        inserted = connection.execute(select(tasks).order_by(tasks.c.seq)).all()
+        for number, (row, (key, text, _)) in enumerate(zip(inserted, rows, strict=True)):
+            assert (row.key, row.payload, row.reason) == (key, text, None)
+            assert (row.preview, row.expires_at) == (bool(number % 2), 0.1)
+            assert (row.payload_digest, row.attempts) == (2**62, 0), "a default"
+
+
+def test_many_rows_are_inserted_all_or_not_at_all(filled: Database) -> None:
+    with pytest.raises(IntegrityError), filled.write() as connection:
+        insert_rows(connection, previews, ("task", "digest"), [(7, "new"), (1, "twice")])
+    with filled.read() as connection:
+        assert ValueQuery[int]("SELECT count(*) FROM previews").first(connection) == 5

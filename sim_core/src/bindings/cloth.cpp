@@ -28,6 +28,7 @@ using BodyTuple = std::tuple<int, std::vector<double>, Eigen::Vector3d, double, 
 using FabricTuple = std::tuple<double, StretchTable, Eigen::Matrix3d, double>;
 
 using BodyRateTuple = std::tuple<Eigen::Vector3d, Eigen::Vector3d>;
+using SensitivityTermTuple = std::tuple<int, int, int, double>;
 using DriveRatesTuple = std::tuple<Points3, Points3, std::vector<BodyRateTuple>>;
 
 using ConditionsCallback =
@@ -220,10 +221,14 @@ void bind_cloth(nb::module_& m) {
           "dt"_a, "gravity"_a, "held"_a, "surfaces"_a, "bodies"_a, "damping"_a, "rates"_a)
       .def(
           "follow",
-          [](ClothSolver& self, const std::vector<std::tuple<int, int, int>>& parameters) {
+          [](ClothSolver& self, const std::vector<std::vector<SensitivityTermTuple>>& parameters) {
             std::vector<SensitivityParameter> list;
-            for (const auto& [kind, first, second] : parameters) {
-              list.push_back({static_cast<SensitivityParameter::Kind>(kind), first, second});
+            for (const auto& terms : parameters) {
+              list.emplace_back();
+              for (const auto& [kind, first, second, rate] : terms) {
+                list.back().push_back(
+                    {static_cast<SensitivityTerm::Kind>(kind), first, second, rate});
+              }
             }
             self.follow(list);
           },

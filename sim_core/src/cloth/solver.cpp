@@ -137,19 +137,9 @@ StepReport ClothSolver::step(double dt, const Points3& gravity, const Points3& h
 }
 
 void ClothSolver::follow(const std::vector<SensitivityParameter>& parameters) {
-  const Eigen::MatrixXd& mu = impl_->materials.mu;
-  const int sheets = impl_->mesh.sheets;
-  for (const SensitivityParameter& by : parameters) {
-    if (by.is_friction_of_body() && by.second >= sheets) {
-      refuse(text("parameter: friction must be with one of ", sheets, " sheets, got sheet ",
-                  by.second));
-    }
-    if (!by.is_friction_of_pair()) continue;
-    const bool known = by.first >= 0 && by.second < mu.rows();
-    if (!known || !(mu(by.first, by.second) >= 0.0)) {
-      refuse(text("parameter: friction must be of two sheets, or of a sheet and a surface, that ",
-                  "touch each other, got ", by.first, " and ", by.second));
-    }
+  for (const SensitivityParameter& parameter : parameters) {
+    for (const SensitivityTerm& term : parameter)
+      refuse_unknown(term, impl_->materials.mu, impl_->mesh.sheets);
   }
   impl_->stepper.sensitivities.follow(parameters);
 }

@@ -8,7 +8,7 @@ import pytest
 
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
-from stickslip_sim_core.cloth.contact import Body, Friction, SelfContact, Surface, plane
+from stickslip_sim_core.cloth.contact import Body, SelfContact, Surface, plane
 from stickslip_sim_core.cloth.fabrics import fabric
 from stickslip_sim_core.cloth.presets import preset_named
 from stickslip_sim_core.cloth.sensitivities import friction
@@ -154,12 +154,23 @@ class TestSameCoefficients:
 
 @pytest.mark.physics
 def test_drag_differs_only_with_a_ratio() -> None:
-    runs = [
-        cloth_drag.scene("gray-interlock", mu, mesh=9, frames=60).run().positions
-        for mu in (0.4, Friction(0.4, 0.4), Friction(0.4, 0.6))
+    family = cloth_drag.family("gray-interlock", 0.4, mesh=9, frames=60)
+    runs = [family.scene(static_ratio=ratio).run().positions for ratio in (1.0, 1.5)]
+    plain = cloth_drag.scene("gray-interlock", 0.4, mesh=9, frames=60).run().positions
+    assert np.array_equal(runs[0], plain)
+    assert np.abs(runs[1] - plain).max() > 1e-4
+
+
+def test_parameters_of_a_drag_change_both_coefficients() -> None:
+    family = cloth_drag.family("gray-interlock", 0.4, static_ratio=1.5, mesh=5, frames=1)
+    by_mu, by_ratio = family.differentiated(["mu", "static_ratio"]).sensitivities
+    assert [(term.kind, term.first, round(term.rate, 6)) for term in by_mu.terms] == [
+        ("friction_of_body", 0, 1.0),
+        ("static_friction_of_body", 0, 1.5),
     ]
-    assert np.array_equal(runs[0], runs[1])
-    assert np.abs(runs[2] - runs[0]).max() > 1e-4
+    assert [(term.kind, term.first, round(term.rate, 6)) for term in by_ratio.terms] == [
+        ("static_friction_of_body", 0, 0.4)
+    ]
 
 
 class TestSensitivities:

@@ -3,7 +3,8 @@
 1. A task has an owner exactly while it is `leased` or `running`, and a retry time exactly while it
    is `soft_failed`.
 2. A task waits for as many others as it has dependencies without results.
-3. `ready_tasks` has a row for each active job that needs a pending task that waits for nothing.
+3. `ready_tasks` has a row for each active job that needs a pending task that waits for nothing. A
+   job that has ended may have rows while it `leaves_queue`.
 4. The totals of each open job say what the rows of its tasks say.
 5. A rejected simulation has rejected its renders.
 """
@@ -125,7 +126,7 @@ def _dependency_faults(connection: Connection) -> list[str]:
 
 
 def _ready_faults(connection: Connection) -> list[str]:
-    """Compare the queue with the tasks; rows of jobs that have ended may stay."""
+    """Compare the queue with the tasks."""
     is_active = jobs.c.state.in_(ACTIVE)
     expected = connection.execute(
         select(job_tasks.c.task, job_tasks.c.job, tasks.c.stage, tasks.c.cost_group)
@@ -144,7 +145,16 @@ def _ready_faults(connection: Connection) -> list[str]:
         else:
             surplus.add(tuple(row))
     faults = [f"{row} is ready, and not in the queue" for row in sorted(missing)]
-    return faults + [f"{row} is in the queue, and not ready" for row in sorted(map(str, surplus))]
+    faults += [f"{row} is in the queue, and not ready" for row in sorted(map(str, surplus))]
+    has_ended = jobs.c.finished_at.is_not(None)
+    stuck = connection.execute(
+        select(ready_tasks)
+        .join(jobs, jobs.c.seq == ready_tasks.c.job)
+        .where(has_ended, ~jobs.c.leaves_queue)
+    )
+    faults += [f"{tuple(row)} is in the queue of a job that has left it" for row in stuck]
+    leaving_early = connection.scalars(select(jobs.c.seq).where(~has_ended, jobs.c.leaves_queue))
+    return faults + [f"job {job} leaves the queue, and has not ended" for job in leaving_early]
 
 
 def _total_faults(connection: Connection) -> list[str]:

@@ -8,12 +8,13 @@ import json
 from datetime import datetime
 from typing import Any
 
-from sqlalchemy import Connection, insert, select
+from sqlalchemy import Connection, bindparam, insert, select
 from stickslip_schemas.base import Document
 
 from stickslip_services.access.principals import current_principal
 from stickslip_services.database import tables
 from stickslip_services.database.database import document_of
+from stickslip_services.database.statements import Statement
 
 
 class Entry(Document):
@@ -29,19 +30,25 @@ class Entry(Document):
     details: dict[str, Any]
 
 
+_APPEND = Statement(
+    insert(tables.audit_log).values(
+        {name: bindparam(name) for name in ("at", "actor", "action", "subject", "details")}
+    )
+)
+
+
 def append(
     connection: Connection, action: str, subject: str, now: float, **details: object
 ) -> None:
     """Append an entry in the transaction of the change; `details` must be JSON."""
-    connection.execute(
-        insert(tables.audit_log).values(
-            at=now,
-            actor=current_principal().name,
-            action=action,
-            subject=subject,
-            details=json.dumps(details, allow_nan=False),
-        )
-    )
+    row = {
+        "at": now,
+        "actor": current_principal().name,
+        "action": action,
+        "subject": subject,
+        "details": json.dumps(details, allow_nan=False),
+    }
+    _APPEND.run(connection, row)
 
 
 def read(connection: Connection, *, subject: str | None = None, limit: int = 100) -> list[Entry]:

@@ -8,7 +8,7 @@ trigger no SQLAlchemy events.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from itertools import islice
 from typing import Any, Generic, Protocol, TypeVar, cast
 
@@ -39,6 +39,18 @@ class _Cursor(Protocol):
     def fetchone(self) -> tuple[Any, ...] | None: ...
 
 
+class _Copy(Protocol):
+    """An open COPY of psycopg."""
+
+    def write_row(self, row: Sequence[object]) -> None: ...
+
+
+class _CopyingCursor(Protocol):
+    """The part of a cursor of psycopg that a COPY needs."""
+
+    def copy(self, sql: str) -> AbstractContextManager[_Copy]: ...
+
+
 def batches(items: Iterable[T], size: int = BATCH) -> Iterator[list[T]]:
     """Yield `items` in lists of at most `size`."""
     iterator = iter(items)
@@ -57,12 +69,32 @@ def rows_with(
 def insert_rows(
     connection: Connection, table: Table, columns: Sequence[str], rows: Iterable[Sequence[object]]
 ) -> None:
-    """Insert many rows with the driver's executemany, at a fifth of the cost of SQL expressions."""
-    mark = {"qmark": "?", "format": "%s"}[connection.dialect.paramstyle]
-    marks = ", ".join([mark] * len(columns))
-    statement = f"INSERT INTO {table.name} ({', '.join(columns)}) VALUES ({marks})"
-    for batch in batches(rows, INSERT_BATCH):
-        connection.exec_driver_sql(statement, cast("Any", batch))
+    """Insert many rows with the driver, at a fifth of the cost of SQL expressions or less."""
+    insert = {"sqlite": _insert_many, "postgresql": _copy}[connection.dialect.name]
+    insert(connection, table.name, columns, rows)
+
+
+def _insert_many(
+    connection: Connection, table: str, columns: Sequence[str], rows: Iterable[Sequence[object]]
+) -> None:
+    """Insert rows by executemany."""
+    marks = ", ".join(["?"] * len(columns))
+    sql = f"INSERT INTO {table} ({', '.join(columns)}) VALUES ({marks})"
+    with _translated_errors(connection, sql):
+        cursor = _cursor(connection)
+        for batch in batches(rows, INSERT_BATCH):
+            cursor.executemany(sql, batch)
+
+
+def _copy(
+    connection: Connection, table: str, columns: Sequence[str], rows: Iterable[Sequence[object]]
+) -> None:
+    """Insert rows by COPY: PostgreSQL's executemany takes twice the CPU time of both sides."""
+    sql = f"COPY {table} ({', '.join(columns)}) FROM STDIN"
+    cursor = cast("_CopyingCursor", connection.connection.cursor())
+    with _translated_errors(connection, sql), cursor.copy(sql) as copy:
+        for row in rows:
+            copy.write_row(row)
 
 
 def _padded(values: Sequence[object]) -> Sequence[object]:

@@ -94,12 +94,15 @@ jobs = _numbered(
     sa.Column("created_at", sa.Float, nullable=False),
     sa.Column("started_at", sa.Float),
     sa.Column("finished_at", sa.Float),
+    # It has ended, and rows of it may be left in `ready_tasks` (queue/leaving.py).
+    sa.Column("leaves_queue", sa.Boolean, nullable=False, server_default=sa.false()),
     sa.Column("dataset", sa.String),
     sa.Column("version", sa.Integer),
     sa.Column("manifest", sa.String),
     # The state is in the index: which jobs may be served, planned or settled is asked all the time.
     sa.Index("ix_jobs_open", "state", "seq", **_partial("finished_at IS NULL")),
     sa.Index("ix_jobs_unplanned", "seq", **_partial("finished_at IS NULL AND builds IS NULL")),
+    sa.Index("ix_jobs_leaves_queue", "seq", **_partial("leaves_queue")),
 )
 
 idempotency_keys = _table(
@@ -180,8 +183,8 @@ job_tasks = _table(
 )
 
 # The queue: a row for each active job that needs a task that can run now. The key begins with the
-# task, so that a lease deletes the rows of its tasks by the key. Rows of a job that has ended stay
-# until another job leases the task: nobody reads them.
+# task, so that a lease deletes the rows of its tasks by the key. Rows of a job that has ended are
+# removed in the background (queue/leaving.py); nobody reads them.
 ready_tasks = _table(
     "ready_tasks",
     _key("task"),

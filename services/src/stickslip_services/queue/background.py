@@ -6,6 +6,7 @@
 | existing datasets | `sweep_seconds` | reads large datasets that existed before their jobs |
 | scrub | `sweep_seconds` | reads datasets that nobody has read for a month, while no job runs |
 | planner | `PLAN_SECONDS` | plans jobs of many samples, piece by piece |
+| queue cleaner | `sweep_seconds` | removes ended jobs from the queue, piece by piece |
 
 `access.webhooks` delivers the webhooks. Each service first asks whether there is work, in a read
 transaction and by an index. So a coordinator with thousands of waiting jobs is nearly idle.
@@ -30,6 +31,7 @@ from stickslip_services.queue.existing_datasets import check_existing_datasets, 
 from stickslip_services.queue.failures import expire_leases
 from stickslip_services.queue.integrity import check_job
 from stickslip_services.queue.job_states import end_job, has_unsettled_job, settle_jobs
+from stickslip_services.queue.leaving import QueueCleaner
 from stickslip_services.queue.planner import Planner, plan_waiting_jobs, release_claims
 from stickslip_services.queue.rows import ACTIVE, IS_LEASED, SCHEDULABLE, JobRow, job_columns
 from stickslip_services.queue.scrub import scrub_when_idle
@@ -62,6 +64,7 @@ def services(context: Context) -> list[Service]:
         Service(partial(check_existing_datasets, context), period),
         Service(partial(scrub_when_idle, context), period),
         Service(Planner(context).run, PLAN_SECONDS),
+        Service(QueueCleaner(context).run, period),
     ]
 
 

@@ -69,6 +69,21 @@ def _append_event(tx: QueueTransaction, job: int, name: EventName, data: Documen
 # ---- Transitions ---------------------------------------------------------------------------------
 
 
+# A job that goes on after a pause keeps its first start.
+_SET_STATE = Statement(
+    update(jobs)
+    .where(jobs.c.seq == bindparam("b_job"))
+    .values(
+        state=bindparam("b_state"),
+        reason=bindparam("b_reason"),
+        message=bindparam("b_message"),
+        started_at=func.coalesce(jobs.c.started_at, bindparam("b_started_at")),
+        finished_at=bindparam("b_finished_at"),
+        leaves_queue=bindparam("b_leaves_queue"),
+    )
+)
+
+
 def set_job_state(
     tx: QueueTransaction,
     job: int,
@@ -78,13 +93,18 @@ def set_job_state(
     message: str = "",
 ) -> None:
     """Set the state of a job with its reason and message, and store the event."""
-    values: dict[str, object] = {"state": state, "reason": reason, "message": message}
-    if state is JobState.running:
-        # A job that goes on after a pause keeps its first start.
-        values["started_at"] = func.coalesce(jobs.c.started_at, tx.now)
-    if not state.is_open:
-        values["finished_at"] = tx.now
-    tx.connection.execute(update(jobs).where(jobs.c.seq == job).values(values))
+    has_ended = not state.is_open
+    values = {
+        "b_job": job,
+        "b_state": state,
+        "b_reason": reason,
+        "b_message": message,
+        "b_started_at": tx.now if state is JobState.running else None,
+        "b_finished_at": tx.now if has_ended else None,
+        # Its rows in the queue are removed in the background: there may be a million.
+        "b_leaves_queue": has_ended,
+    }
+    _SET_STATE.run(tx.connection, values)
     event = JobStateEvent(state=state, reason=reason, message=message)
     _append_event(tx, job, EventName.job_state, event)
 

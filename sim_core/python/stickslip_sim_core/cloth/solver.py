@@ -509,7 +509,7 @@ class Cloth:
             ValueError: A parameter is friction of what does not touch the cloth.
         """
         self._parameters = tuple(parameters)
-        self._solver.follow([parameter.as_tuple() for parameter in self._parameters])
+        self._solver.follow([parameter.as_tuples() for parameter in self._parameters])
         self._before_sensitivities = (self._no_sensitivities(), self._no_sensitivities())
 
     def set_sensitivities(self, positions: ArrayLike, velocities: ArrayLike | None = None) -> None:
@@ -567,6 +567,8 @@ class Cloth:
         return self._between(time, self._before_sensitivities, now, straight=straight)
 
     def _rates_at(self, time: float, bodies: int) -> list[RatesTuple]:
+        for parameter in self._parameters:
+            parameter.check_bodies(bodies)
         rates = [parameter.rates_at(time) for parameter in self._parameters]
         # The solver reads a row for each thing, and a missing one would be memory of others.
         for by_parameter in rates:

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,20 +14,34 @@ from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.contact import Friction, SelfContact
 from stickslip_sim_core.cloth.presets import preset_named
 from stickslip_sim_core.cloth.solver import Cloth
-from stickslip_sim_core.scenes.holders import Holder
+from stickslip_sim_core.scenes.family import SceneFamily, SceneParameter
+from stickslip_sim_core.scenes.holders import Hang, Hanging, Holder, hung
 from stickslip_sim_core.scenes.kind import IMPOSSIBLE_START, Kind, OnFrame, Outcome, Record
 from stickslip_sim_core.scenes.parts import Document, Sheet, Thing, sheet, thing
 from stickslip_sim_core.scenes.scene import ClothRun, Scene, cloth_kernel, fabric_labels
-
-UPRIGHT = 1.0
-"""Time in which gravity turns upright over a hung sheet after its bias ends [s]."""
-
+from stickslip_sim_core.scenes.sensitivities import positions_by
 
 FrictionOfPairs = Mapping[tuple[str, str], Friction]
 """Friction by the names of a sheet and of another sheet or a body."""
 
 
-def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Scene:
+class FamilyParameter(NamedTuple):
+    """A number of a document that scenes of a family differ in."""
+
+    places: Sequence[Sequence[str | int]]
+    """Where the number is: names, and positions in lists. It is the same at all places."""
+    low: float
+    high: float
+    unit: str = "1"
+
+
+UPRIGHT = 1.0
+"""Time in which gravity turns upright over a hung sheet after its bias ends [s]."""
+
+
+def scene(
+    document: Document, *, seed: int = 0, kernel: str | None = None, hang: Hang = hung
+) -> Scene:
     """Return the scene of a document.
 
     The document is `Physics` of stickslip_schemas.scene, as JSON, with arrays in place of files.
@@ -46,13 +60,14 @@ def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Sc
     - `BODY.rest` and `BODY.triangles` of a body of triangles, and `BODY.vertices` (frame, vertex,
       3) [m] if it deforms
 
-    `seed` draws the biases that break the symmetry of the scene. For `kernel`, see `Cloth`.
+    `seed` draws the biases that break the symmetry of the scene. For `kernel`, see `Cloth`. `hang`
+    lets sheets hang.
 
     Raises:
         ValueError: A value breaks its rule. The message begins with the place of the value.
     """
     friction = _friction(document)
-    sheets = _sheets(document, seed, kernel)
+    sheets = _sheets(document, seed, kernel, hang)
     things = _things(document, sheets, friction)
     held = _held(sheets)
     gravity = _Gravity(document, sheets, seed)
@@ -88,10 +103,11 @@ def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Sc
             *(f"sheets.{part.name}" for part in sheets),
         ],
         reason=_hanging_fault(sheets),
+        hangings=_hangings(sheets),
     )
 
 
-def _sheets(document: Document, seed: int, kernel: str | None) -> list[Sheet]:
+def _sheets(document: Document, seed: int, kernel: str | None, hang: Hang) -> list[Sheet]:
     """Return the sheets in the order of their names."""
     sheets = []
     for name, described in sorted(document["sheets"].items()):
@@ -102,6 +118,7 @@ def _sheets(document: Document, seed: int, kernel: str | None) -> list[Sheet]:
             gravity=document["gravity"],
             seed=seed,
             kernel=kernel,
+            hang=hang,
         )
         # The solver counts every connected piece as a sheet. Two pieces under one name would shift
         # the numbers of all later sheets.
@@ -182,6 +199,17 @@ def _tracks(things: Sequence[Thing], held: _Held) -> dict[str, Callable[[float],
             [holder.holds(time) for holder in held.holders], np.uint8
         )
     return tracks
+
+
+def _hangings(sheets: Sequence[Sheet]) -> list[Hanging]:
+    """Return the sheets that hang at the start."""
+    hangings = []
+    begins = _vertex_begins(sheets)
+    for number, part in enumerate(sheets):
+        if part.hung is not None:
+            begin = int(begins[number])
+            hangings.append(Hanging(number, begin, part.mesh, part.fabric, part.hung))
+    return hangings
 
 
 def _hanging_fault(sheets: Sequence[Sheet]) -> str:
@@ -382,6 +410,10 @@ def _arrays(run: ClothRun, sheets: Sequence[Sheet], things: Sequence[Thing]) -> 
         arrays[f"{part.name}.positions"] = positions
         arrays[f"{part.name}.rest"] = part.mesh.rest
         arrays[f"{part.name}.triangles"] = part.mesh.triangles
+    for name, derivatives in positions_by(run.sensitivities).items():
+        of_sheets = np.split(derivatives, inner_begins, axis=1)
+        for part, of_sheet in zip(sheets, of_sheets, strict=True):
+            arrays[f"{part.name}.{name}"] = of_sheet
     for body in things:
         if body.surface is not None:
             arrays[f"{body.name}.rest"] = body.rest
@@ -404,14 +436,62 @@ def _labels(
     return labels
 
 
+def family(
+    document: Document,
+    parameters: Mapping[str, FamilyParameter],
+    *,
+    seed: int = 0,
+    kernel: str | None = None,
+) -> SceneFamily:
+    """Return the scenes of a document that differ in the numbers at some places.
+
+    Args:
+        document: As of `scene`.
+        parameters: For each name the places in the document of one number, and its range.
+        seed: As of `scene`.
+        kernel: As of `scene`.
+    """
+    known = {}
+    for name, (places, low, high, unit) in parameters.items():
+        known[name] = SceneParameter(float(_value_at(document, places[0])), low, high, unit)
+
+    def make(values: Mapping[str, float], hang: Hang) -> Scene:
+        changed = document
+        for name, value in values.items():
+            for place in parameters[name].places:
+                changed = _with_value(changed, place, value)
+        return scene(changed, seed=seed, kernel=kernel, hang=hang)
+
+    return SceneFamily(known, make)
+
+
+def _value_at(document: Any, place: Sequence[str | int]) -> Any:
+    for step in place:
+        document = document[step]
+    return document
+
+
+def _with_value(document: Any, place: Sequence[str | int], value: float) -> Any:
+    """Return a document with another value at a place; it shares all else with the first one."""
+    if not place:
+        return value
+    step, *further = place
+    copy: Any = dict(document) if isinstance(document, Mapping) else list(document)
+    copy[step] = _with_value(document[step], further, value)
+    return copy
+
+
 def _simulated(scene_and_seed: Mapping[str, Any], on_frame: OnFrame | None) -> Outcome:
     """Return the outcome of a simulation.
 
     Values that do not fit together are a reason to reject the simulation before it starts. A later
     error is a bug, and the caller gets it.
     """
+    asked = scene_and_seed.get("sensitivities", {})
+    parameters = {name: FamilyParameter(*places) for name, places in asked.items()}
     try:
-        simulated_scene = scene(scene_and_seed["scene"], seed=scene_and_seed["seed"])
+        scenes = family(scene_and_seed["scene"], parameters, seed=scene_and_seed["seed"])
+        simulated_scene = scenes.differentiated(tuple(parameters))
     except ValueError as error:
         return Outcome(reason=str(error), code=IMPOSSIBLE_START)
     return simulated_scene.outcome(on_frame)

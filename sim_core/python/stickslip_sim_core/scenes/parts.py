@@ -24,7 +24,7 @@ from stickslip_sim_core.cloth.contact import (
     sphere,
 )
 from stickslip_sim_core.cloth.fabrics import Fabric, custom_fabric, fabric
-from stickslip_sim_core.scenes.holders import ALWAYS, Holder, Hung, hung
+from stickslip_sim_core.scenes.holders import ALWAYS, Hang, Holder, Hung, hung
 from stickslip_sim_core.scenes.motions import Keyframes, MovingMesh, RigidMotion, Spin, rotation
 
 Document = Mapping[str, Any]
@@ -71,10 +71,11 @@ def sheet(
     gravity: ArrayLike,
     seed: int,
     kernel: str | None,
+    hang: Hang = hung,
 ) -> Sheet:
     """Return a sheet of a document. `materials` are its custom fabrics.
 
-    Hung cloth hangs under `gravity` (3,) [m/s^2], and `seed` draws its tilt.
+    Hung cloth hangs under `gravity` (3,) [m/s^2], and `seed` draws its tilt. `hang` lets it hang.
 
     Raises:
         ValueError: A value breaks its rule. The message begins with the place of the value.
@@ -129,7 +130,7 @@ def sheet(
     # Holders take the hung cloth at its flat positions: `hung` does not move held vertices.
     hanging = None
     if begin["type"] == "hung":
-        hanging = hung(
+        hanging = hang(
             mesh,
             cloth_fabric,
             start,

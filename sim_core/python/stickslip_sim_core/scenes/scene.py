@@ -10,15 +10,22 @@ from numpy.typing import ArrayLike, NDArray
 from stickslip_sim_core._sim_core import build_info
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import checks
-from stickslip_sim_core.cloth.contact import Body, Friction, SelfContact, Surface
+from stickslip_sim_core.cloth.contact import Body, SelfContact, Surface
 from stickslip_sim_core.cloth.fabrics import Fabric, custom_fabric, fabric
 from stickslip_sim_core.cloth.meshes import Mesh
 from stickslip_sim_core.cloth.presets import SolverSettings
 from stickslip_sim_core.cloth.solver import Cloth
 from stickslip_sim_core.scenes.evenness import uneven_until
 from stickslip_sim_core.scenes.frames import frame_at
-from stickslip_sim_core.scenes.holders import Hands, Holder
+from stickslip_sim_core.scenes.holders import Hands, Hanging, Holder
 from stickslip_sim_core.scenes.kind import IMPOSSIBLE_START, Array, Kind, OnFrame, Outcome, Record
+from stickslip_sim_core.scenes.sensitivities import (
+    Followed,
+    SceneSensitivity,
+    Sensitivity,
+    events_of,
+    positions_by,
+)
 
 REST_SPEED = 1e-3
 """Largest mean speed of a vertex between two frames at which cloth is at rest [m/s]."""
@@ -76,6 +83,9 @@ class ClothRun:
     reason: str
     """The reason in words, or empty."""
 
+    sensitivities: Mapping[str, Sensitivity] = field(default_factory=dict)
+    """Derivatives by the parameters that the scene was differentiated by, by their names."""
+
     @property
     def valid(self) -> bool:
         return not self.code
@@ -86,6 +96,7 @@ class Begun(NamedTuple):
 
     hands: Hands
     cloth: Cloth
+    followed: Followed
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -146,6 +157,7 @@ class Scene:
         "positions": run.positions,
         "rest": run.rest,
         "triangles": run.triangles,
+        **positions_by(run.sensitivities),
     }
     """Function that returns the arrays of the run to store besides its record."""
 
@@ -163,6 +175,12 @@ class Scene:
 
     reason: str = ""
     """Reason why no run of the scene is valid, or empty."""
+
+    hangings: Sequence[Hanging] = ()
+    """Sheets that hang at the start."""
+
+    sensitivities: Sequence[SceneSensitivity] = ()
+    """What a run is differentiated by: see `SceneFamily.differentiated`."""
 
     def begin(self) -> Begun:
         """Return the cloth at the start of the scene, and its holders.
@@ -182,7 +200,7 @@ class Scene:
             kernel=self.kernel,
         )
         cloth.set_state(self.start, bodies=self.motion(0.0)[1])
-        return Begun(hands, cloth)
+        return Begun(hands, cloth, Followed(self.sensitivities, hands, cloth))
 
     def run(self, on_frame: OnFrame | None = None, begun: Begun | None = None) -> ClothRun:
         """Simulate the scene until it ends, or until a check has failed.
@@ -193,7 +211,7 @@ class Scene:
         Raises:
             ValueError: The scene cannot begin.
         """
-        hands, cloth = self.begin() if begun is None else begun
+        hands, cloth, followed = begin = self.begin() if begun is None else begun
         first = frame_at(cloth, 0.0, lambda time: self.motion(time)[1])
         paths = [first.positions]
         forces = [self.forces(cloth)]
@@ -201,15 +219,17 @@ class Scene:
         calm = 0
         rest_time = np.nan
         verdict = checks.Verdict(cloth)
+        derivatives = [followed.at_frame(first)]
         # No run of a scene with a reason is valid, so it has its first frame alone.
         for frame in range(1, 1 if self.reason else self.frames):
             time = frame / self.frame_rate
-            self._advance(cloth, hands, time, verdict)
+            self._advance(begin, time, verdict)
             # A check has failed, or the budget is spent, and the cloth has not reached the frame.
             if cloth.time < time:
                 break
             now = frame_at(cloth, time, lambda time: self.motion(time)[1])
             paths.append(now.positions)
+            derivatives.append(followed.at_frame(now))
             crossed.append(now.crossings)
             forces.append(self.forces(cloth))
             if on_frame is not None:
@@ -223,7 +243,7 @@ class Scene:
         # A scene that has come to rest repeats its last frame. Every sample of the scene then has
         # the same number of frames.
         missing = 0 if np.isnan(rest_time) else self.frames - len(paths)
-        for frames in (paths, forces, crossed):
+        for frames in (paths, forces, crossed, derivatives):
             frames += missing * frames[-1:]  # type: ignore[operator]
         path = np.stack(paths)
         times = np.arange(len(path)) / self.frame_rate
@@ -258,12 +278,14 @@ class Scene:
                 "unconverged_steps": cloth.total.unconverged,
                 "worst_residual": cloth.worst_residual,
                 **worst,
+                **followed.labels(derivatives),
             },
             self_intersections=np.array(crossed, np.int32),
             least_distance=cloth.total.least_distance,
             rest_time=rest_time,
             code=code,
             reason=reason,
+            sensitivities=followed.over_frames(derivatives),
         )
         # Labels of the scene may depend on the run, such as the side on which a cloth landed.
         return replace(run, labels={**run.labels, **self.labels(run)})
@@ -274,17 +296,24 @@ class Scene:
             return False
         return float(np.linalg.norm(now - before, axis=1).max()) <= REST_SPEED / self.frame_rate
 
-    def _advance(self, cloth: Cloth, hands: Hands, end: float, verdict: checks.Verdict) -> None:
+    def _advance(self, begun: Begun, end: float, verdict: checks.Verdict) -> None:
         """Take steps until one ends at `end` [s] or later, and grasp and release on the way.
 
         A lost run stops before.
         """
+        hands, cloth, followed = begun
         poses = self.poses
+
+        def see_step() -> bool:
+            followed.see_step()
+            return verdict.see_step()
+
         path = None if poses is None else lambda times: (hands.at(times), poses(times))
         while cloth.time < end and cloth.spent <= 1.0 and not verdict.is_lost:
             # A step ends exactly at each event, so equal times are a safe test.
             if cloth.time in hands.events:
                 cloth.hold(hands.take(cloth.time, cloth.positions), self.motion(cloth.time)[1])
+                followed.take(cloth.time)
             event = min((event for event in hands.events if event > cloth.time), default=np.inf)
             cloth.advance(
                 min(end, event),
@@ -292,7 +321,7 @@ class Scene:
                 path=path,
                 event=event,
                 damping=self.damping,
-                is_over=verdict.see_step,
+                is_over=see_step,
                 may_fail=verdict.allows_failure,
             )
 
@@ -315,7 +344,7 @@ class Scene:
             return Outcome(reason=f"{run.reason}; worst values: {worst}", code=run.code)
         # Cut off rather than wrapped around to negative numbers.
         crossings = np.minimum(run.self_intersections, np.iinfo(np.int16).max).astype(np.int16)
-        arrays: Record = {**self.arrays(run), **run.record}
+        arrays: Record = {**self.arrays(run), **run.record, **events_of(run.sensitivities)}
         single = {
             name: a.astype(np.float32) if a.dtype.kind == "f" else a for name, a in arrays.items()
         }
@@ -351,16 +380,9 @@ def cloth_kind(scene: Callable[..., Scene]) -> Kind:
 
 
 def _of_materials(physics: Mapping[str, Any]) -> dict[str, Any]:
-    """Return physics with a fabric instead of its name, custom numbers and factors.
-
-    Friction is a pair where what rests holds more than what slides.
-    """
+    """Return physics with a fabric instead of its name and custom numbers."""
     known = dict(physics)
-    factors = {name: known.pop(name, 1.0) for name in ("density", "bending", "stretching")}
     name = known.pop("material")
     numbers = known.pop("fabric", None)
     made = fabric(name) if numbers is None else custom_fabric(name, **numbers)
-    ratio = known.pop("static_ratio", 1.0)
-    if ratio != 1.0:
-        known["mu"] = Friction(known["mu"], ratio * known["mu"])
-    return {**known, "material": made.scaled(**factors)}
+    return {**known, "material": made}
