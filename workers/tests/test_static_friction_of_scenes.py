@@ -52,9 +52,9 @@ def test_scene_holds_by_the_static_coefficient_and_slides_by_the_kinetic_one(
 
 
 def test_both_coefficients_alike_are_mu_bit_by_bit() -> None:
-    one = positions({"mu": 0.3}, {"type": "plane"})
-    two = positions({"static": 0.3, "kinetic": 0.3}, {"type": "plane"})
-    assert np.array_equal(one, two)
+    of_mu = positions({"mu": 0.3}, {"type": "plane"})
+    of_both = positions({"static": 0.3, "kinetic": 0.3}, {"type": "plane"})
+    assert np.array_equal(of_mu, of_both)
 
 
 def test_ratio_of_a_drag_reaches_its_floor() -> None:
