@@ -76,6 +76,13 @@ def _parser() -> argparse.ArgumentParser:
     lab.add_argument("request", type=Path, help="the test, the fabric and options as JSON")
     lab.set_defaults(run=_lab)
 
+    fit = commands.add_parser("fit", help="fit parameters, as `stickslip fit` hands them over")
+    fit.add_argument("scene", type=Path, help="the scene as JSON")
+    fit.add_argument("--store", required=True, help="store of the files that it names")
+    fit.add_argument("--observations", type=Path, required=True, help="NPZ file")
+    fit.add_argument("--request", required=True, help="parameters and options as JSON")
+    fit.set_defaults(run=_fit)
+
     describe = commands.add_parser("describe", help="print the builds of this environment")
     describe.set_defaults(run=_describe)
     return parser
@@ -306,6 +313,25 @@ def _lab(options: argparse.Namespace) -> int:
 
     try:
         answer = run_test(json.loads(options.request.read_text(encoding="utf-8")))
+    except (ValueError, OSError) as error:
+        sys.stderr.write(f"error: {error}\n")
+        return 2
+    sys.stdout.write(json.dumps(answer) + "\n")
+    return 0
+
+
+def _fit(options: argparse.Namespace) -> int:
+    """Return 0 if there is an answer, and 2 if not."""
+    import numpy as np
+    from stickslip_schemas.scene.document import Scene
+
+    from stickslip_workers.fitting import fit_scene
+
+    try:
+        scene = Scene.model_validate_json(options.scene.read_bytes())
+        with np.load(options.observations, allow_pickle=False) as arrays:
+            observed = dict(arrays)
+        answer = fit_scene(scene, observed, json.loads(options.request), open_store(options.store))
     except (ValueError, OSError) as error:
         sys.stderr.write(f"error: {error}\n")
         return 2

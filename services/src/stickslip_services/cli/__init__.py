@@ -32,7 +32,7 @@ _SECTIONS = {
         "jobs",
     ),
     "Datasets": dict.fromkeys(("datasets", "pull", "verify", "sign", "export"), "datasets"),
-    "Scenes": dict.fromkeys(("scene", "simulate"), "specs"),
+    "Scenes": {"scene": "specs", "simulate": "specs", "fit": "fitting"},
     "Fabrics": dict.fromkeys(("fabrics", "lab"), "laboratory"),
     "Certificates": dict.fromkeys(("certify", "register", "certificates"), "workers"),
     "Measurement": {"measure": "measuring"},

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 DOCUMENT_NAME = "certificate.json"
 RESULT_NAME = "scene.json"
+EXPLAINED = 1.5
+"""Mean squared residual over the noise, up to which the noise explains observations."""
 TRAJECTORY_NAME = "trajectory.npz"
 
 
@@ -157,6 +159,20 @@ def preview(scene: Scene, files: Mapping[str, bytes], out: Path) -> list[str]:
         answer = _workers(["preview", *arguments, "--out", str(out)])
     pictures: list[str] = answer["pictures"]
     return pictures
+
+
+def fit(
+    scene: Scene, files: Mapping[str, bytes], observations: Path, request: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Fit parameters of a scene to observed vertices; raise CommandError.
+
+    `observations` is an NPZ file, and `request` has the options of the workers' program.
+    """
+    if not observations.is_file():
+        raise CommandError(f"there is no file {observations}")
+    with _written(scene, files) as (arguments, _):
+        options = ["--observations", str(observations), "--request", json.dumps(request)]
+        return _workers(["fit", *arguments, *options], "nothing was fitted")
 
 
 @contextmanager

@@ -1,0 +1,265 @@
+"""Observations of cloth for `fit`: vertices, marked points in pictures, and silhouettes."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stickslip_sim_core.arrays import Floats, check_positive
+from stickslip_sim_core.fit import check_observed
+from stickslip_sim_core.scenes.scene import ClothRun
+
+OUTLINE_STEP = 1e-3
+"""Distance beside an edge, over its length, at which the picture must be empty for an outline."""
+
+
+def check_frames(frames: Sequence[int], vertices: NDArray[np.intp], run: ClothRun) -> None:
+    """Check that a run has these frames and vertices.
+
+    Raises:
+        ValueError: A frame or a vertex does not exist.
+    """
+    count, size = run.positions.shape[:2]
+    if not all(0 <= frame < count for frame in frames):
+        raise ValueError(f"frames: must be within 0 ... {count - 1} of the run, got {list(frames)}")
+    if len(vertices) and not (vertices.min() >= 0 and vertices.max() < size):
+        raise ValueError(
+            f"vertices: must be within 0 ... {size - 1} of the run, got {vertices.max()}"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Vertices:
+    """Positions of vertices at some frames.
+
+    Raises:
+        ValueError: An argument breaks its rule.
+    """
+
+    frames: Sequence[int]
+    """Numbers of frames: (T,)."""
+
+    positions: Floats
+    """Positions that were seen: (T, K, 3) [m]."""
+
+    vertices: NDArray[np.intp]
+    """Vertices that were seen: (K,)."""
+
+    noise: float
+    """Standard deviation of each coordinate [m]."""
+
+    def __post_init__(self) -> None:
+        check_positive(noise=self.noise)
+        shape = (len(self.frames), len(self.vertices), 3)
+        check_observed("positions", np.asarray(self.positions, float), shape)
+
+    @property
+    def count(self) -> int:
+        return int(np.size(self.positions))
+
+    def check(self, run: ClothRun) -> None:
+        check_frames(self.frames, self.vertices, run)
+
+    def residual(self, run: ClothRun) -> Floats:
+        return np.asarray((self._picked(run.positions) - self.positions).ravel() / self.noise)
+
+    def jacobian(self, run: ClothRun, derivative: Floats) -> Floats:
+        return np.asarray(self._picked(derivative).ravel() / self.noise)
+
+    def _picked(self, points: Floats) -> Floats:
+        return np.asarray(points[list(self.frames)][:, self.vertices])
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A pinhole camera: the pixel of x is K (R x + t) over its third component."""
+
+    matrix: Floats
+    """K [R | t]: (3, 4), with pixels as the unit of its first two rows."""
+
+    def __post_init__(self) -> None:
+        check_observed("matrix", np.asarray(self.matrix, float), (3, 4))
+
+    def project(self, points: Floats) -> Floats:
+        """Return the pixels of points (..., 3) [m]: (..., 2)."""
+        homogeneous = points @ self.matrix[:, :3].T + self.matrix[:, 3]
+        return np.asarray(homogeneous[..., :2] / homogeneous[..., 2:])
+
+    def project_change(self, points: Floats, changes: Floats) -> Floats:
+        """Return the changes of the pixels of points by changes of the points (..., 3)."""
+        homogeneous = points @ self.matrix[:, :3].T + self.matrix[:, 3]
+        moved = changes @ self.matrix[:, :3].T
+        depth = homogeneous[..., 2:]
+        return np.asarray((moved[..., :2] - moved[..., 2:] * homogeneous[..., :2] / depth) / depth)
+
+
+@dataclass(frozen=True, eq=False)
+class MarkedPixels:
+    """Pixels of marked vertices at some frames.
+
+    Raises:
+        ValueError: An argument breaks its rule.
+    """
+
+    frames: Sequence[int]
+    """Numbers of frames: (T,)."""
+
+    pixels: Floats
+    """Pixels that were seen: (T, K, 2)."""
+
+    vertices: NDArray[np.intp]
+    """Vertices that are marked: (K,)."""
+
+    view: View
+    noise: float
+    """Standard deviation of each coordinate [px]."""
+
+    def __post_init__(self) -> None:
+        check_positive(noise=self.noise)
+        shape = (len(self.frames), len(self.vertices), 2)
+        check_observed("pixels", np.asarray(self.pixels, float), shape)
+
+    @property
+    def count(self) -> int:
+        return int(np.size(self.pixels))
+
+    def check(self, run: ClothRun) -> None:
+        check_frames(self.frames, self.vertices, run)
+
+    def residual(self, run: ClothRun) -> Floats:
+        projected = self.view.project(self._points(run.positions))
+        return np.asarray((projected - self.pixels).ravel() / self.noise)
+
+    def jacobian(self, run: ClothRun, derivative: Floats) -> Floats:
+        changes = self.view.project_change(self._points(run.positions), self._points(derivative))
+        return np.asarray(changes.ravel() / self.noise)
+
+    def _points(self, points: Floats) -> Floats:
+        return np.asarray(points[list(self.frames)][:, self.vertices])
+
+
+@dataclass(frozen=True, eq=False)
+class Silhouettes:
+    """Points on the outlines of the cloth in pictures.
+
+    The residual of a point is its distance from the outline of the run, along the outward normal.
+
+    Raises:
+        ValueError: An argument breaks its rule.
+    """
+
+    frames: Sequence[int]
+    """Numbers of frames: (T,)."""
+
+    outlines: Sequence[Floats]
+    """Points on the outline of each frame: (N, 2) [px]."""
+
+    view: View
+    noise: float
+    """Standard deviation of the distance [px]."""
+
+    def __post_init__(self) -> None:
+        check_positive(noise=self.noise)
+        if len(self.outlines) != len(self.frames):
+            raise ValueError(
+                f"outlines: must be one for each of {len(self.frames)} frames, "
+                f"got {len(self.outlines)}"
+            )
+        for number, points in enumerate(self.outlines):
+            check_observed(f"outlines[{number}]", np.asarray(points, float), (None, 2))
+
+    @property
+    def count(self) -> int:
+        return sum(len(points) for points in self.outlines)
+
+    def check(self, run: ClothRun) -> None:
+        check_frames(self.frames, np.empty(0, np.intp), run)
+
+    def residual(self, run: ClothRun) -> Floats:
+        parts = []
+        for frame, points in zip(self.frames, self.outlines, strict=True):
+            nearest = self._nearest(run, frame, np.asarray(points, float))
+            parts.append(nearest.distances / self.noise)
+        return np.concatenate(parts)
+
+    def jacobian(self, run: ClothRun, derivative: Floats) -> Floats:
+        parts = []
+        for frame, points in zip(self.frames, self.outlines, strict=True):
+            nearest = self._nearest(run, frame, np.asarray(points, float))
+            ends = nearest.edges
+            moved = self.view.project_change(run.positions[frame][ends], derivative[frame][ends])
+            change = (nearest.shares[..., None] * moved).sum(axis=1)
+            # The distance from the observed point falls as the outline moves towards it.
+            parts.append(-(change * nearest.normals).sum(axis=1) / self.noise)
+        return np.concatenate(parts)
+
+    def _nearest(self, run: ClothRun, frame: int, points: Floats) -> "_Nearest":
+        pixels = self.view.project(run.positions[frame])
+        return _nearest_on_outline(pixels, run.triangles, points)
+
+
+@dataclass(frozen=True, eq=False)
+class _Nearest:
+    """The points of an outline that are nearest to observed ones."""
+
+    edges: NDArray[np.intp]
+    """Ends of the edge of each: (N, 2)."""
+    shares: Floats
+    """Weights of these ends: (N, 2)."""
+    normals: Floats
+    """Unit vectors away from the cloth: (N, 2)."""
+    distances: Floats
+    """Distances of the observed points along the normals: (N,) [px]."""
+
+
+def _nearest_on_outline(pixels: Floats, triangles: NDArray[np.int32], points: Floats) -> _Nearest:
+    edges, normals = outline(pixels, triangles)
+    a, b = pixels[edges[:, 0]], pixels[edges[:, 1]]
+    along = b - a
+    share = ((points[:, None] - a) * along).sum(axis=-1) / (along**2).sum(axis=-1)
+    share = share.clip(0.0, 1.0)
+    offsets = points[:, None] - (a + share[..., None] * along)
+    nearest = (offsets**2).sum(axis=-1).argmin(axis=1)
+    number = np.arange(len(points))
+    at_edge = share[number, nearest]
+    distances = (offsets[number, nearest] * normals[nearest]).sum(axis=1)
+    shares = np.stack([1.0 - at_edge, at_edge], axis=1)
+    return _Nearest(edges[nearest], shares, normals[nearest], distances)
+
+
+def outline(pixels: Floats, triangles: NDArray[np.int32]) -> tuple[NDArray[np.intp], Floats]:
+    """Return the edges of projected triangles (E, 2) that bound them all, and outward normals.
+
+    Args:
+        pixels: Projected vertices (V, 2) [px].
+        triangles: Vertices of the triangles (T, 3).
+    """
+    pairs = np.concatenate([triangles[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
+    edges = np.unique(np.sort(pairs, axis=1), axis=0).astype(np.intp)
+    along = pixels[edges[:, 1]] - pixels[edges[:, 0]]
+    length = np.linalg.norm(along, axis=1, keepdims=True)
+    edges, along, length = (part[length[:, 0] > 0.0] for part in (edges, along, length))
+    across = np.stack([along[:, 1], -along[:, 0]], axis=1) / length
+    middle = 0.5 * (pixels[edges[:, 0]] + pixels[edges[:, 1]])
+    step = OUTLINE_STEP * length * across
+    is_right = ~_covered(middle + step, pixels, triangles)
+    is_left = ~_covered(middle - step, pixels, triangles)
+    # An edge with cloth on neither side is the trace of a fold seen end on, and bounds nothing.
+    is_outline = is_right != is_left
+    normals = np.where(is_right[:, None], across, -across)
+    return edges[is_outline], normals[is_outline]
+
+
+def _covered(points: Floats, pixels: Floats, triangles: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """Return which points (N, 2) are in a projected triangle."""
+    corners = pixels[triangles]
+    sides = []
+    for first, second in ((0, 1), (1, 2), (2, 0)):
+        a, b = corners[:, first], corners[:, second]
+        d = b - a
+        offset = points[:, None] - a
+        sides.append(d[:, 0] * offset[..., 1] - d[:, 1] * offset[..., 0])
+    signs = np.stack(sides)
+    inside = np.asarray((signs > 0.0).all(axis=0) | (signs < 0.0).all(axis=0))
+    return np.asarray(inside.any(axis=1), dtype=np.bool_)
