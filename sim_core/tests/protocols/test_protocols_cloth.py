@@ -232,6 +232,7 @@ class TestPresets:
             "gripper",
             "stick-slip",
             "cantilever",
+            "soft-cantilever",
             "lateral-buckling",
             "inclined-plane",
         }

@@ -51,6 +51,13 @@ RATIO_MAX = 50.0
 Of 618 measured fabrics, four standard deviations are within 12 to 1 and 28 to 1. A number in mN m
 beside one in N m has a ratio of about 1,000.
 """
+SOFTENING_BOUNDS = (50.0, 1e5)
+"""Bounds of the curvature by which bending softens [1/m].
+
+Below, the bound is reached at radii of centimetres; above, nothing softens that a mesh resolves.
+"""
+PER_CENTIMETRE, PER_MILLIMETRE = 100.0, 1000.0
+"""Over 1/m."""
 LEAST_TWIST = 0.1
 """Least rigidity of twist, over the smaller of the other two: it must be positive, and the
 difference of measured numbers may not be."""
@@ -154,6 +161,13 @@ class FabricNumbers(Document):
     damping: Float = Field(
         default=0.0, ge=0, le=10, description="damping force over momentum [1/s]"
     )
+    softening: Float | None = Field(
+        default=None,
+        exclude_if=lambda softening: softening is None,
+        description="curvature D0/|b| [1/m] by which bending softens, M = (D0 - |b| k) k for "
+        "curvatures k up to half of it, and D0 k/2 beyond; measured fabrics have 160 to 1,090. "
+        "Null: the rigidity is constant",
+    )
     source: str | None = Field(
         default=None,
         max_length=500,
@@ -167,9 +181,7 @@ class FabricNumbers(Document):
         """Return a card with rigidities in N m, whatever form and unit they have."""
         if not isinstance(card, dict):
             return card
-        if "softening" in card:
-            rule = "must be left out: the solver bends with a constant rigidity"
-            _refuse(cls.__name__, ("softening",), rule, card["softening"])
+        _check_softening(card.get("softening"))
         stated = card.get("bending")
         density = card.get("density")
         if not isinstance(stated, dict):
@@ -230,6 +242,26 @@ class FabricNumbers(Document):
             return "isotropic"
         length = bending_length(math.sqrt(rigidity[0] * rigidity[1]), self.density)
         return f"bending length {1e3 * length:.1g} mm"
+
+
+def _check_softening(softening: Any) -> None:
+    """Raise ValidationError for a curvature of softening that no cloth has, or of another unit."""
+    # Wrong types, and what is not finite, have errors of their own.
+    is_number = isinstance(softening, int | float) and not isinstance(softening, bool)
+    if not (is_number and math.isfinite(softening)):
+        return
+    low, high = SOFTENING_BOUNDS
+    if low <= softening <= high:
+        return
+    hint = ""
+    if softening < 0:
+        hint = "; give D0 over the size of b: a negative b softens"
+    elif low <= softening * PER_CENTIMETRE <= high:
+        hint = "; is it in 1/cm?"
+    elif low <= softening * PER_MILLIMETRE <= high:
+        hint = "; is it in 1/mm?"
+    rule = f"must be from {low:g} to {high:g} 1/m{hint}"
+    _refuse("FabricNumbers", ("softening",), rule, softening)
 
 
 def _check_table(table: Sequence[tuple[float, float, float, float]]) -> None:
@@ -348,6 +380,15 @@ MEASURED_CORRELATION = (
 """Statistics of 618 fabrics [Feng et al. 2022]: of log10 of the mass per area [kg/m^2], and of the
 rigidities along the warp, along the weft and at 45 degrees [N m]."""
 
+SOFTENING_QUANTILES = (
+    (0.05, 162.0),
+    (0.25, 275.0),
+    (0.50, 372.0),
+    (0.75, 540.0),
+    (0.95, 1088.0),
+)
+"""Quantiles of D0/|b| of the same fabrics [1/m], over warp and weft."""
+
 Range = tuple[Positive, Positive]
 
 
@@ -359,10 +400,16 @@ class FabricRanges(Document):
     weft: Range = Field(description="rigidity along the weft, low and high")
     diagonal: Range = Field(description="rigidity at 45 degrees to both, low and high")
     unit: Unit = Field(description="unit of the rigidities")
+    softening: Range | None = Field(
+        default=None,
+        description="curvature by which bending softens, low and high [1/m]; null: none softens",
+    )
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
-        for name in ("density", "warp", "weft", "diagonal"):
+        for name in ("density", "warp", "weft", "diagonal", "softening"):
+            if getattr(self, name) is None:
+                continue
             low, high = getattr(self, name)
             if not low <= high:
                 rule = f"must be [low, high], low at most high, and it is {[low, high]}"
@@ -409,6 +456,8 @@ class FabricDistribution(Document):
             ValidationError: Too few draws are of cloth.
         """
         stream = random.Random(self.seed)
+        # It has a stream of its own, since nothing is known of how it goes with the other numbers.
+        of_softening = random.Random(f"softening {self.seed}")
         cards: dict[str, dict[str, Any]] = {}
         for number in range(self.num):
             card = self._drawn_card(stream)
@@ -420,6 +469,9 @@ class FabricDistribution(Document):
                 )
                 value = self.model_dump(mode="json")["distribution"]
                 _refuse(type(self).__name__, ("distribution",), rule, value)
+            softening = self._softening(_within(of_softening.random()))
+            if softening is not None:
+                card["softening"] = softening
             cards[f"{self._word}-{self.seed}-{number}"] = card
         return cards
 
@@ -444,6 +496,15 @@ class FabricDistribution(Document):
                     "source": f"drawn from {self._word}, seed {self.seed}",
                 }
         return None
+
+    def _softening(self, share: float) -> float | None:
+        """Return the curvature of softening [1/m] for a share of (0, 1), or None."""
+        if not isinstance(self.distribution, FabricRanges):
+            return _rounded(_measured_softening(share))
+        if self.distribution.softening is None:
+            return None
+        low, high = self.distribution.softening
+        return _rounded(low * (high / low) ** share)
 
 
 def _within(share: float) -> float:
@@ -472,6 +533,20 @@ def _measured_draw(normals: Sequence[float]) -> tuple[float, float, float, float
         drawn.append(10.0 ** (mean + deviation * correlated))
     density, warp, weft, diagonal = drawn
     return density, warp, weft, diagonal
+
+
+def _measured_softening(share: float) -> float:
+    """Return the quantile of D0/|b| of the 618 fabrics [1/m]; its logarithm is linear between.
+
+    The lowest and the highest known quantile stand for all beyond them.
+    """
+    (below, low), *_ = SOFTENING_QUANTILES
+    for at, value in SOFTENING_QUANTILES:
+        if share <= at:
+            part = 1.0 if at == below else (share - below) / (at - below)
+            return low * math.exp(max(part, 0.0) * math.log(value / low))
+        below, low = at, value
+    return low
 
 
 @cache

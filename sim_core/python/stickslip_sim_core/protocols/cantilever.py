@@ -1,7 +1,7 @@
 """Cantilever: the sag of a strip of cloth that is clamped horizontally [Romero et al. 2021]."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -84,16 +84,21 @@ def finer(gamma: float) -> int:
 
 
 def hang(
-    clamped: Strip, gamma: float, preset: SolverSettings, stretching: float = STRETCHING
+    clamped: Strip,
+    gamma: float,
+    preset: SolverSettings,
+    stretching: float = STRETCHING,
+    softening: float | None = None,
 ) -> tuple[float, Cloth]:
     """Let a strip that starts straight and horizontal settle, and return H/W and the cloth.
 
-    H/W is NaN if the strip did not come to rest.
+    H/W is NaN if the strip did not come to rest. For `softening` see `Fabric`.
     """
     weight = DENSITY * GRAVITY * LENGTH  # N/m
+    laid = isotropic(DENSITY, stretching * weight, weight * LENGTH**2 / gamma)
     cloth = Cloth(
         clamped.mesh,
-        isotropic(DENSITY, stretching * weight, weight * LENGTH**2 / gamma),
+        replace(laid, softening=softening),
         preset,
         held=clamped.held,
         force_scale=FORCE_SHARE / finer(gamma) * DENSITY * GRAVITY * RESIDUAL_PATCH,
