@@ -13,8 +13,11 @@ from stickslip_sim_core.reference.boundary_values import NotSolvedError
 RELATIVE, ABSOLUTE = 1e-11, 1e-13
 """Tolerances of the integration, with which the drop has nine digits."""
 
-TIPS = 200
+TIPS = 64
 """Number of angles of the tip between which the solution is looked for."""
+
+STEEPEST = 0.5 * np.pi - 1e-9
+"""Angle of the steepest of them: a heavy strip hangs nearly upright [rad]."""
 
 
 def soft_cantilever(gamma: float, softening: float) -> float:
@@ -36,7 +39,7 @@ def soft_cantilever(gamma: float, softening: float) -> float:
     Raises:
         NotSolvedError: No angle of the tip leaves the clamp horizontally.
     """
-    tips = np.linspace(0.0, 0.5 * np.pi, TIPS + 1)[1:-1]
+    tips = np.linspace(0.0, STEEPEST, TIPS)
     missed = [_clamp(tip, gamma, softening)[0] for tip in tips]
     for number in range(len(tips) - 1, 0, -1):
         if missed[number - 1] * missed[number] <= 0.0:
