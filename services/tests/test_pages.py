@@ -106,7 +106,7 @@ def test_a_job_from_queue_to_dataset(client: httpx.Client, worker: PretendWorker
     assert slowest.count("<td>1.0 s</td><td>2.0 s</td>") == 8  # PretendWorker reports so much each
     assert re.search(r"<dt>ended</dt><dd>20[\d: -]+ UTC</dd>", page)
     assert re.search(r"<dt>wall time</dt><dd>[\d.]+ s</dd>", page)
-    assert re.search(r"usual without cached tasks: about [\d.]+ s", page)
+    assert re.search(r"\(without cached tasks usually about [\d.]+ s, ", page)
     assert "so far" not in page
     assert "6 of 6 (100 %)" in page
     path = re.search(r"/datasets/ds-[0-9a-f]+/v1", page)

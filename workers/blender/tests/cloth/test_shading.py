@@ -97,6 +97,12 @@ def test_deviations_grow_with_the_spread_of_frames_and_of_blocks() -> None:
     assert pool_errors(frames).deviations == pytest.approx([expected] * 3)
     assert pool_errors(frames).psnr == pytest.approx(pool_errors(even).psnr)
 
+    # Frames that were not measured have another error: one of three, and none of two.
+    some, whole = pool_errors(frames, frame_count=3), pool_errors(frames, frame_count=2)
+    expected = 10.0 / np.log(10.0) * np.sqrt(within**2 + between / 3)
+    assert some.deviations == pytest.approx([expected] * 3)
+    assert whole.deviations == pytest.approx([10.0 / np.log(10.0) * within] * 3)
+
 
 def test_a_mean_below_zero_counts_as_its_deviation() -> None:
     """Products of noise may be negative: the error is then as large as chance makes it."""
@@ -128,11 +134,14 @@ def test_a_clip_below_its_floor_says_so() -> None:
 
 def test_measured_frames_are_drawn_from_equal_parts_of_the_clip() -> None:
     for seed in range(20):
-        drawn = instants(30, 0.25, 6, (seed, 3))
-        assert [frame // (30 // len(drawn)) for frame in drawn] == list(range(len(drawn)))
+        drawn = instants(30, 0.25, 6, 2, (seed, 3))
+        for part, frame in enumerate(drawn):
+            assert int(30 * part / len(drawn)) <= frame < 30 * (part + 1) / len(drawn)
         assert len(drawn) >= 3
-    assert instants(5, 9.0, 16, (1, 3)) == [0, 1, 2, 3, 4]
-    assert len(instants(2, 0.0, 4, (1, 3))) == 1
+    assert instants(5, 9.0, 16, 2, (1, 3)) == [0, 1, 2, 3, 4]
+    # One frame of a short clip says little about the others.
+    assert instants(3, 0.1, 4, 2, (1, 3)) == [0, 1, 2]
+    assert len(instants(12, 0.1, 4, 2, (1, 3))) == 4
     assert measured_group("checker") == ("checker", "dots", "stripes")
     names = [str(texture) for texture in Texture]
     for number, name in enumerate(names):
