@@ -128,15 +128,15 @@ def test_marks_are_where_their_labels_say(
     )
     clips = output_of(actor, task).clips
     frames = [_frame(store, clips[name].output, size) for name in (marks, white)]
-    shown, lit = (decoded(frame).astype(float).sum(axis=2) for frame in frames)
+    level, lit = (decoded(frame).astype(float).sum(axis=2) for frame in frames)
 
     camera = _camera(size)
-    rows, columns = np.indices(shown.shape)
+    rows, columns = np.indices(level.shape)
     for mark in MARKS:
         expected = _middle_of_mark(camera, mark)
         reach = 1.35 * RADIUS * SIDE * camera.fx / camera.project(np.zeros((1, 3)))[1][0]
         near = np.hypot(columns - expected[0], rows - expected[1]) < reach
-        share = shown[near] / lit[near]
+        share = level[near] / lit[near]
         share = (share - share.min()) / (np.median(share[share > 0.5]) - share.min())
         # Within the mark and beside it, only noise and light from other cloth differ from 1 and 0.
         share = np.where(share > 1.0 - PLAIN, 1.0, np.where(share < PLAIN, 0.0, share))
