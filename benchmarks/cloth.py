@@ -40,7 +40,7 @@ def run(material: str, mu: float, preset: str, vertices: int, seconds: float) ->
     cloth = Cloth(mesh, fabric(material), settings, held=held)
     cloth.set_state(hung.positions)
     hands = Hands([Holder(hung.held, cloth_drag.holder_pose)], hung.positions)
-    motion = hands.driving(cloth_drag.motion_of(hung, mu))
+    motion = hands.driving(cloth_drag.motion_of(hung, plane(mu)))
     floor = np.tile(plane(mu).pose, (64, 1, 1, 1))
     cloth.advance(seconds, motion, path=lambda times: (hands.at(times), floor[: len(times)]))
     cpu = time.process_time() - start

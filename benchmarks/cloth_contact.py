@@ -28,6 +28,7 @@ from stickslip_sim_core import (
     Cloth,
     SelfContact,
     fabric,
+    plane,
     preset_named,
     protocols,
     self_intersections,
@@ -67,7 +68,7 @@ def dragged(
     cloth = Cloth(mesh, fabric(material), preset_named("certified"), held=held, self_contact=feels)
     cloth.set_state(hung.positions)
     hands = Hands([Holder(hung.held, cloth_drag.holder_pose)], hung.positions)
-    motion = hands.driving(cloth_drag.motion_of(hung, 0.5))
+    motion = hands.driving(cloth_drag.motion_of(hung, plane(0.5)))
     crossed = looking = 0.0
 
     def watched(at: float) -> tuple[Floats, ArrayLike, Sequence[Body]]:

@@ -2,7 +2,8 @@
 
 Its root is an overlay in memory, with a network, a host name and pids of its own. What a sandbox
 cannot have is replaced by a stand-in of the same name: `sudo` changes the user, `systemctl` starts
-units (units.py), NFS is a bind mount, `scp` copies on this machine, `exportfs` does nothing.
+units (units.py), NFS is a bind mount, `scp` copies on this machine, `exportfs` does nothing, and
+`docker` runs the containers of a compose file (containers.py).
 """
 
 import os
@@ -31,6 +32,7 @@ for file in "${@:1:$#-1}"; do
   [ "$file" -ef "$target/$(basename "$file")" ] || cp "$file" "$target"
 done""",
     "exportfs": "exit 0",
+    "docker": f'exec {sys.executable} {ROOT / "tests" / "containers.py"} "$@"',
 }
 
 _ENTER = """set -eu

@@ -94,3 +94,38 @@ stickslip verify /home/me/my-rods
 """
     done = run(script, sandbox)
     assert done.returncode == 0, (done.stdout + done.stderr)[-6000:]
+
+
+@pytest.mark.real
+@pytest.mark.timeout(1200)
+def test_the_guide_of_containers_runs_without_docker(sandbox: Path) -> None:
+    """Each service starts as compose.yaml and its Dockerfile say, is healthy, and makes a dataset.
+
+    Not tried: building of images, MinIO, limits of memory and cores, rotation of logs, restarts.
+    """
+    code = script_of("deploy-containers.md")
+    build = next(b for b in code.split("\n\n") if "docker compose build" in b)
+    submit = next(b for b in code.split("\n\n") if "stickslip submit" in b)
+    submit = submit.replace("../../examples/demo-rods.yaml", "/home/me/few.yaml")
+    script = f"""
+cat > /home/me/few.yaml <<'END'
+{FEW}END
+cp -r /opt/stickslip/deploy /home/me
+cd /home/me
+{build}
+export STICKSLIP_URL=http://coordinator:8765
+{submit}
+stickslip verify my-rods
+docker compose exec --no-TTY worker sh -c 'test ! -w / && test ! -w /data && touch /tmp/file'
+docker compose exec --no-TTY coordinator sh -c 'test ! -w / && touch /data/file'
+docker compose ps
+docker compose down
+"""
+    done = run(script, sandbox)
+    assert done.returncode == 0, (done.stdout + done.stderr)[-6000:]
+    lines = done.stdout.splitlines()
+    names = ("coordinator-1", "worker-1", "worker-2")
+    # Twice: the guide asks, and the end of this test does.
+    assert [lines.count(f"{name} running") for name in names] == [2, 2, 2], done.stdout
+    # What we start ends on SIGTERM within its grace, also as the first process of a container.
+    assert [lines.count(f"{name}: ended") for name in names] == [1, 1, 1], done.stdout

@@ -4,7 +4,7 @@
 
     python tools/release_check.py [--python python3.11] [--keep DIR] [--with-tests]
 
-1. Every pin of the constraints is on the index with its public version: no folder of wheels helps.
+1. pip resolves the pins of all environments with public versions: no folder of wheels helps.
 2. `make setup` and `make demo` of a fresh clone end well. Their minutes, CPU seconds, packages and
    gigabytes are written to tools/setup_measurements.json, which README.md must agree with.
 3. With `--with-tests`, `make setup-dev` and `make test` are measured, too.
@@ -14,25 +14,20 @@ import argparse
 import contextlib
 import json
 import os
-import re
 import shutil
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from setup_environment import pip_settings
+from setup_environment import ENVIRONMENTS, pip_settings
 
 ROOT = Path(__file__).parents[1]
 MEASUREMENTS = ROOT / "tools" / "setup_measurements.json"
-INDEX_REQUESTS = 8
-"""So many pins are looked up at the same time."""
-
 DEMO_CPU_SECONDS = 400
 """The demo must not take more CPU time than this after set-up [s]."""
 
@@ -68,25 +63,36 @@ def public_environment(python: str) -> dict[str, str]:
     return environment
 
 
-def find_missing_pins(python: str) -> list[str]:
-    """Return the pins that the index does not have in their public version."""
-    pins = []
-    for path in sorted(ROOT.glob("constraints*.txt")):
-        for line in path.read_text(encoding="utf-8").splitlines():
-            if line and not line.startswith("#"):
-                pins.append(line)
-    environment = public_environment(python)
+def resolve_pins(python: str, name: str) -> list[str]:
+    """Let pip resolve an environment with public versions alone, and return the local ones.
 
-    def is_missing(pin: str) -> bool:
-        name, _, version = pin.partition("==")
-        command = [python, "-m", "pip", "index", "versions", name]
-        done = subprocess.run(command, capture_output=True, text=True, env=environment)
-        versions = re.findall(r"[\w.+!-]+", done.stdout.partition("Available versions:")[2])
-        return version not in versions
-
-    with ThreadPoolExecutor(INDEX_REQUESTS) as pool:
-        missing = list(pool.map(is_missing, pins))
-    return [pin for pin, is_gone in zip(pins, missing, strict=True) if is_gone]
+    Nothing is installed. Ends the program if pip finds no solution.
+    """
+    environment = ENVIRONMENTS[name]
+    with tempfile.TemporaryDirectory() as folder:
+        report = Path(folder) / "report.json"
+        options = ["--quiet", "--dry-run", "--ignore-installed", "--report", str(report)]
+        done = subprocess.run(
+            [
+                *(python, "-m", "pip", "install", *options),
+                *(
+                    "--constraint",
+                    environment.constraints,
+                    "--requirement",
+                    environment.requirements,
+                ),
+            ],
+            cwd=ROOT,
+            env=public_environment(python),
+            capture_output=True,
+            text=True,
+        )
+        if done.returncode != 0:
+            sys.exit(f"pip cannot resolve {environment.requirements}:\n{done.stderr[-2000:]}")
+        packages = json.loads(report.read_text(encoding="utf-8"))["install"]
+    print(f"{environment.requirements}: {len(packages)} packages, from the index alone", flush=True)
+    versions = {p["metadata"]["name"]: p["metadata"]["version"] for p in packages}
+    return [f"{name}=={version}" for name, version in versions.items() if "+" in version]
 
 
 class CpuMeter(threading.Thread):
@@ -179,6 +185,7 @@ def measure(clone: Path, python: str, with_tests: bool) -> dict[str, Any]:
             },
         },
         "minutes": {"setup": round(setup.minutes), "demo": round(demo.minutes)},
+        "load": round(os.getloadavg()[2], 1),
         "demo_cpu_seconds": round(demo.cpu_seconds),
     }
     if with_tests:
@@ -212,9 +219,10 @@ def main() -> int:
     parser.add_argument("--keep", type=Path, help="clone into this empty folder, and keep it")
     parser.add_argument("--with-tests", action="store_true", help="run make test, too")
     options = parser.parse_args()
-    missing = find_missing_pins(options.python)
-    if missing:
-        sys.exit(f"pins that the index does not have: {', '.join(missing)}")
+    for name in ENVIRONMENTS:
+        local = resolve_pins(options.python, name)
+        if local:
+            sys.exit(f"versions that are on no public index: {', '.join(local)}")
     folder = options.keep or Path(tempfile.mkdtemp(prefix="stickslip-release-"))
     try:
         clone = folder / "clone"

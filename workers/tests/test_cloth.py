@@ -62,6 +62,7 @@ class Core:
         mesh: int,
         frames: int,
         seed: int,
+        **_factors: float,
     ) -> Any:
         self.calls.append((material.name, mu, self_friction, preset, mesh, frames, seed))
         square = meshes.grid(0.2, 0.2, mesh - 1, mesh - 1)

@@ -17,7 +17,9 @@ from stickslip_schemas.base import Reason, Stage
 from stickslip_schemas.documents.tasks import RecordRef, RenderTask, SimulateTask
 from stickslip_schemas.kinds.cloth_drag import ClothDragSimulation
 from stickslip_schemas.kinds.rod_hang import RodHangRender, RodHangSimulation
+from stickslip_schemas.plan.costs import MachineSpeed
 from stickslip_schemas.store import DirectoryStore
+from stickslip_workers import dispatcher
 from stickslip_workers.cluster import RayCluster
 from stickslip_workers.dispatcher import Dispatcher
 from stickslip_workers.lease_client import CoordinatorError
@@ -161,6 +163,25 @@ def test_runs_what_it_is_given_and_says_who_it_is(
     assert double.condition.state == "ready"
     assert double.condition.slots == 2
     assert registration.versions["fake"] == "1"
+
+
+def test_a_worker_is_ready_once_the_speed_of_its_machine_is_known(
+    start: Start, double: CoordinatorDouble, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Otherwise, the first estimates would be those of another machine."""
+    is_measured = threading.Event()
+
+    def machine_speed(_file: Path, _slots: int) -> MachineSpeed:
+        is_measured.wait(60.0)
+        return MachineSpeed(cpu_speed=0.5)
+
+    monkeypatch.setattr(dispatcher, "machine_speed", machine_speed)
+    start()
+    double.until(lambda: "the speed of this machine" in double.condition.reason)
+    assert double.condition.state == "starting"
+    is_measured.set()
+    double.until(lambda: double.condition.state == "ready")
+    assert double.condition.speed == MachineSpeed(cpu_speed=0.5)
 
 
 def test_what_goes_wrong_has_a_reason(start: Start, double: CoordinatorDouble) -> None:

@@ -104,6 +104,18 @@ def test_examples_are_specs(name: str, kind: type, count: int) -> None:
             "-0.1",
         ),
         (changed(CLOTH, "/axes/mu", -0.1), "/axes/mu", "greater than or equal to 0", "-0.1"),
+        (
+            changed(CLOTH, "/axes/static_ratio", [1.0, 0.9]),
+            "/axes/static_ratio/1",
+            "greater than or equal to 1",
+            "0.9",
+        ),
+        (
+            changed(changed(CLOTH, "/axes/mu", [0.5, 5]), "/axes/static_ratio", [1.5, 2.5]),
+            "/axes/static_ratio/1",
+            "times the largest mu, 5, must be at most 10",
+            "2.5",
+        ),
         (changed(CLOTH, "/axes/texture", "velvet"), "/axes/texture", "herringbone", '"velvet"'),
         (changed(CLOTH, "/mesh", 3), "/mesh", "greater than or equal to 5", "3"),
         (changed(RODS, "/axes/gamma", [float("nan")]), "/axes/gamma/0", "finite number", "NaN"),

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from stickslip_schemas.base import sha256
-from stickslip_schemas.scene import files, gate
+from stickslip_schemas.scene import gate, surface_rules
 from stickslip_schemas.scene.document import Scene
 from stickslip_schemas.scene.files import (
     UnfitFileError,
@@ -199,7 +199,7 @@ def test_a_small_file_cannot_ask_for_much_memory() -> None:
 
 
 def test_meshes_have_limits(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(files, "MAX_VERTICES", 2)
+    monkeypatch.setattr(surface_rules, "MAX_VERTICES", 2)
     with pytest.raises(UnfitFileError, match="at most 2 vertices"):
         read_file(BODY, FLAT)
     monkeypatch.setattr(gate, "MAX_FILE_BYTES", 10)
@@ -250,3 +250,34 @@ def test_built_in_scenes_are_whole(name: str) -> None:
     assert loaded.parameters
     for place, file in loaded.files():
         check_scene_file(loaded, place, built_in_files()[file.removeprefix("sha256:")])
+
+
+def test_the_files_of_a_scene_are_limited_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each of many files may be small enough, and reading all of them takes a minute."""
+    corners = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]])
+    moving = {"positions": np.stack([corners, corners]), "triangles": np.array([[0, 1, 2]])}
+    data = {
+        "towel.obj": FLAT,
+        "near.npz": npz(**moving, times=np.arange(2.0)),
+        "far.npz": npz(**moving, times=2.0 * np.arange(2.0)),
+    }
+    sizes = {}
+    for name, location in (("towel.obj", MESH), ("near.npz", BODY), ("far.npz", BODY)):
+        arrays = read_file(location, data[name])
+        sizes[name] = max(len(data[name]), sum(array.nbytes for array in arrays.values()))
+
+    document = scene("towel.obj").model_dump(mode="json")
+    body = {"type": "mesh", "file": "near.npz"}
+    document["bodies"] = {"block": body, "other": body}
+    limit = sum(sizes.values()) - 1
+    monkeypatch.setattr(gate, "MAX_SCENE_BYTES", limit)
+    # A file that two bodies name counts once.
+    inlined(Scene.model_validate(document), data.__getitem__)
+    document["bodies"]["other"] = body | {"file": "far.npz"}
+    rule = rf"bodies\.other\.file: must have at most {limit} bytes together .*, in far\.npz"
+    with pytest.raises(UnfitFileError, match=rule):
+        inlined(Scene.model_validate(document), data.__getitem__)
+    # The bytes of a file count before it is read.
+    monkeypatch.setattr(gate, "MAX_SCENE_BYTES", len(FLAT) - 1)
+    with pytest.raises(UnfitFileError, match="together"):
+        inlined(scene("towel.obj"), lambda _name: FLAT.replace(b"f", b"?"))

@@ -20,7 +20,9 @@ from stickslip_schemas.scene.geometry import (
     find_touch,
 )
 from stickslip_schemas.scene.library import built_in_files, load_scene, scene_names
+from stickslip_schemas.scene.mesh_bodies import moving_meshes
 from stickslip_schemas.scene.motions import Track
+from stickslip_schemas.scene.reading import reading_files_once
 from stickslip_schemas.scene.shapes import box_rounding
 from stickslip_schemas.scene.start import check_start, find_start_faults
 from stickslip_schemas.spec.jobs import StartFault
@@ -788,3 +790,16 @@ def test_a_linear_motion_with_ramps_is_exact() -> None:
     # Speed 0.5 m/s after a ramp of 0.2 s: v t^2 / (2 r) within it, v (t - r / 2) after it.
     expected = [0.0, 0.0125, 0.05, 0.2, 0.45, 0.4875, 0.5, 0.5]
     assert x == pytest.approx(expected, abs=1e-12)
+
+
+def test_bodies_of_one_file_share_its_motion_and_stand_at_their_own_places() -> None:
+    moved = {"keys": [{"time": 0.0, "move": [0.0, 0.0, 0.5]}]}
+    document: Any = deepcopy(SCENE)
+    body = {"type": "mesh", "file": "cube.obj"}
+    document["bodies"] |= {"still": body, "raised": body | {"motion": moved}}
+    scene, files = inlined(Scene.model_validate(document), FILES.__getitem__)
+    with reading_files_once():
+        meshes = moving_meshes(with_arrays(scene, files.__getitem__))
+    assert meshes["still"].frames is meshes["raised"].frames
+    shift = meshes["raised"].surface.vertices - meshes["still"].surface.vertices
+    assert np.allclose(shift, [0.0, 0.0, 0.5])

@@ -19,6 +19,7 @@ SCENE: dict[str, Any] = {
     "materials": {"felt": {"density": 0.3, "young": 1e6, "poisson": 0.3, "thickness": 1e-3}},
     "parameters": {
         "mu": {"low": 0, "high": 2, "sets": ["friction.ball.lower"]},
+        "static": {"low": 0.4, "high": 2, "sets": ["friction.rod.upper.static"]},
         "fabric": {"sets": ["sheets.lower.material"]},
         "speed": {"unit": "rad/s", "low": -5, "high": 5, "sets": ["bodies.ball.motion.spin.speed"]},
     },
@@ -59,6 +60,7 @@ SCENE: dict[str, Any] = {
     "friction": [
         {"between": ["lower", "ball"], "mu": 0.5},
         {"between": ["upper", "lower"], "mu": 0.2},
+        {"between": ["upper", "rod"], "static": 0.5, "kinetic": 0.35},
     ],
     "default_friction": 0.4,
     "looks": {
@@ -234,6 +236,12 @@ WRONG: list[tuple[Any, ...]] = [
     ("bodies.actor.frame_rate", -1.0, "", "greater than 0 [1/s]"),
     ("bodies.upper", {"type": "plane"}, "", "names of their own", '"upper"'),
     ("friction.0.mu", 11.0, "", "less than or equal to 10"),
+    ("friction.0.static", 0.6, "friction.0", "mu alone, or static and kinetic"),
+    ("friction.0.mu", GONE, "friction.0", "must have mu, or both static and kinetic"),
+    ("friction.2.static", 0.1, "friction.2", "kinetic must be at most static, and 0.35 is above"),
+    ("friction.2.static", 11.0, "", "less than or equal to 10"),
+    ("friction.2.kinetic", NAN, "", "finite number"),
+    ("friction.2.kinetic", GONE, "friction.2", "must have mu, or both static and kinetic"),
     ("friction.0.between", ["ball", "floor"], "", "must name two that may touch"),
     ("friction.0.between", ["ball", "bal"], "", "must name two that may touch; did you mean ball"),
     ("friction.1.between", ["ball", "lower"], "", "must name two once"),
@@ -251,6 +259,20 @@ WRONG: list[tuple[Any, ...]] = [
         "parameters.mu.sets.0",
         "no pair of ball and tower",
     ),
+    (
+        "parameters.mu.sets",
+        ["friction.rod.upper"],
+        "parameters.mu.sets.0",
+        "which has friction.rod.upper.static and friction.rod.upper.kinetic",
+    ),
+    (
+        "parameters.mu.sets",
+        ["friction.ball.lower.static"],
+        "parameters.mu.sets.0",
+        "which has one, friction.ball.lower",
+    ),
+    ("parameters.static.high", 20.0, "", "friction.2.static: must be less than or equal to 10"),
+    ("parameters.static.low", 0.1, "", "kinetic must be at most static"),
     ("parameters.mu.high", 20.0, "", "friction.0.mu: must be less than or equal to 10"),
     ("parameters.mu.low", 3.0, "", "low below high"),
     ("parameters.mu.low", 1.0, "parameters.mu.sets.0", "a default within 1 to 2", "0.5"),
@@ -315,7 +337,7 @@ PURE = {
     "FloorNumbers": {"albedo", "roughness", "metallic", "specular", "grain", "tint"},
     "LampNumbers": {"power"},
     "MeshBody": {"strength"},
-    "Pair": {"mu"},
+    "Pair": {"mu", "static", "kinetic"},
     "Parameter": {"low", "high", "values"},  # their unit is data
     "Plane": {"normal"},
     "Scene": {"default_friction"},

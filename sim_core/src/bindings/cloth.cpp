@@ -22,12 +22,13 @@ using namespace nb::literals;
 
 namespace {
 
-using BodyTuple =
-    std::tuple<int, std::vector<double>, Eigen::Vector3d, double, Eigen::Vector3d, Eigen::Matrix3d>;
+using BodyTuple = std::tuple<int, std::vector<double>, Eigen::Vector3d, double, Eigen::Vector3d,
+                             Eigen::Matrix3d, std::vector<double>>;
 
 using FabricTuple = std::tuple<double, StretchTable, Eigen::Matrix3d, double>;
 
 using BodyRateTuple = std::tuple<Eigen::Vector3d, Eigen::Vector3d>;
+using SensitivityTermTuple = std::tuple<int, int, int, double>;
 using DriveRatesTuple = std::tuple<Points3, Points3, std::vector<BodyRateTuple>>;
 
 using ConditionsCallback =
@@ -55,8 +56,8 @@ std::vector<DriveRates> rates_of(const std::vector<DriveRatesTuple>& tuples) {
 
 std::vector<Body> bodies_of(const std::vector<BodyTuple>& tuples) {
   std::vector<Body> bodies;
-  for (const auto& [shape, mu, core, radius, origin, rotation] : tuples) {
-    bodies.push_back({shape, mu, core, radius, origin, rotation});
+  for (const auto& [shape, mu, core, radius, origin, rotation, mu_static] : tuples) {
+    bodies.push_back({shape, mu, core, radius, origin, rotation, mu_static});
   }
   return bodies;
 }
@@ -176,7 +177,7 @@ void bind_cloth(nb::module_& m) {
              const std::vector<double>& thickness, const Eigen::MatrixXd& mu, double edge_fraction,
              double second_fraction, const Triangles& surface_triangles,
              const std::vector<std::int32_t>& surface_of_vertex, const Points3& surface_positions,
-             const std::vector<double>& crease) {
+             const std::vector<double>& crease, const Eigen::MatrixXd& mu_static) {
             std::vector<ClothProperties> list;
             for (const auto& [density, stretching, rigidity, damping] : fabrics) {
               list.push_back({density, stretching, rigidity, damping});
@@ -191,14 +192,15 @@ void bind_cloth(nb::module_& m) {
                              {step_error, longest_step, finest},
                              kernel,
                              {thickness, mu, static_cast<int>(thickness.size() - crease.size()),
-                              edge_fraction, second_fraction},
+                              edge_fraction, second_fraction, mu_static},
                              {surface_triangles, surface_of_vertex, surface_positions, crease}});
           },
           "rest"_a, "triangles"_a, "fabrics"_a, "held"_a, nb::kw_only(), "tolerance"_a,
           "newton_max"_a, "krylov_tolerance"_a, "refactor_after"_a, "newton_before_halving"_a,
           "halvings_max"_a, "second_order"_a, "step_error"_a, "longest_step"_a, "finest"_a,
           "kernel"_a, "thickness"_a, "mu"_a, "edge_fraction"_a, "second_fraction"_a,
-          "surface_triangles"_a, "surface_of_vertex"_a, "surface_positions"_a, "crease"_a)
+          "surface_triangles"_a, "surface_of_vertex"_a, "surface_positions"_a, "crease"_a,
+          "mu_static"_a)
       .def(
           "set_state",
           [](ClothSolver& self, const Points3& positions, const Points3& velocities,
@@ -219,10 +221,14 @@ void bind_cloth(nb::module_& m) {
           "dt"_a, "gravity"_a, "held"_a, "surfaces"_a, "bodies"_a, "damping"_a, "rates"_a)
       .def(
           "follow",
-          [](ClothSolver& self, const std::vector<std::tuple<int, int, int>>& parameters) {
+          [](ClothSolver& self, const std::vector<std::vector<SensitivityTermTuple>>& parameters) {
             std::vector<SensitivityParameter> list;
-            for (const auto& [kind, first, second] : parameters) {
-              list.push_back({static_cast<SensitivityParameter::Kind>(kind), first, second});
+            for (const auto& terms : parameters) {
+              list.emplace_back();
+              for (const auto& [kind, first, second, rate] : terms) {
+                list.back().push_back(
+                    {static_cast<SensitivityTerm::Kind>(kind), first, second, rate});
+              }
             }
             self.follow(list);
           },
@@ -255,6 +261,7 @@ void bind_cloth(nb::module_& m) {
           },
           "time"_a, "event"_a, "conditions"_a, "table"_a, "may_fail"_a)
       .def("momentum_rate", &ClothSolver::momentum_rate)
+      .def("damping_force", &ClothSolver::damping_force)
       .def("positions", &ClothSolver::positions)
       .def("velocities", &ClothSolver::velocities)
       .def("reactions", &ClothSolver::reactions)

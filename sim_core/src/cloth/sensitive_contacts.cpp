@@ -89,22 +89,24 @@ void Sensitivities::classify_nodes(const Step& step) {
   }
 }
 
-// How much of the coefficient of a node's contact is the parameter.
+// How much the coefficient of a node's contact changes by the parameter.
 double Sensitivities::friction_rate(int parameter, int node, const NodeContact& contact) const {
-  using Kind = SensitivityParameter::Kind;
-  const SensitivityParameter& by = parameters_[parameter];
-  const int sheet = newton_.contact.sheet[node], bodies = bodies_;
-  const bool on_surface = contact.on.body >= bodies;
-  if (by.kind == Kind::friction_of_body && !on_surface) {
-    if (by.second >= 0 && by.second != sheet) return 0.0;
-    return contact.friction.by_mu *
-           contact.on.average([&](int b) -> double { return b == by.first ? 1.0 : 0.0; });
+  const int sheet = newton_.contact.sheet[node];
+  const bool on_surface = contact.on.body >= bodies_;
+  double rate = 0.0;
+  for (const SensitivityTerm& by : parameters_[parameter]) {
+    if (!by.is_of(newton_.contact.cone[node])) continue;
+    if (by.is_friction_of_body() && !on_surface) {
+      if (by.second >= 0 && by.second != sheet) continue;
+      rate +=
+          by.rate * contact.on.average([&](int b) -> double { return b == by.first ? 1.0 : 0.0; });
+    }
+    if (by.is_friction_of_pair() && on_surface) {
+      const int surface = newton_.pairs->materials.sheets + contact.on.body - bodies_;
+      if (by.first == sheet && by.second == surface) rate += by.rate;
+    }
   }
-  if (by.kind == Kind::friction_of_pair && on_surface) {
-    const int surface = newton_.pairs->materials.sheets + contact.on.body - bodies;
-    return by.first == sheet && by.second == surface ? contact.friction.by_mu : 0.0;
-  }
-  return 0.0;
+  return contact.friction.by_mu * rate;
 }
 
 // `motion`: of the node over the body, m per unit; `turn` of the body, rad per unit.

@@ -54,13 +54,17 @@ PairMotions Sensitivities::motions_of(const Pair& pair, const Buffer<double>& ve
   return out;
 }
 
-bool Sensitivities::is_parameter(int parameter, const Pair& pair) const {
-  const SensitivityParameter& by = parameters_[parameter];
-  if (by.kind != SensitivityParameter::Kind::friction_of_pair) return false;
+// How much the coefficient of a pair changes by the parameter.
+double Sensitivities::friction_rate(int parameter, const Pair& pair) const {
   const std::vector<int>& sheet_of_node = newton_.pairs->near.surface.sheet_of_node;
   const auto [low, high] =
       std::minmax(sheet_of_node[pair.stencil.node[0]], sheet_of_node[pair.stencil.node[3]]);
-  return low == by.first && high == by.second;
+  double rate = 0.0;
+  for (const SensitivityTerm& by : parameters_[parameter]) {
+    const bool is_of_pair = by.is_friction_of_pair() && by.is_of(pair.cone.value_or(Cone::sliding));
+    if (is_of_pair && low == by.first && high == by.second) rate += by.rate;
+  }
+  return rate;
 }
 
 // Sets the right-hand sides of pairs to what their laws lack at d, and `pulled_` to the change of
@@ -82,7 +86,7 @@ void Sensitivities::linearize_pairs(int parameter) {
     const double pressing = r.dot(n), normal_change = contact.change.dot(n) + r.dot(dn);
     const Vector3d friction_change =
         in_plane(contact.change - normal_change * n - pressing * dn, n);
-    const double own_rate = is_parameter(parameter, pair) ? 1.0 : 0.0;
+    const double own_rate = friction_rate(parameter, pair);
     contact.event = event_at(pressing, normal_change);
     if (pair.row.mode == contact_stick) {
       contact.right_side = -kappa * opening * n - pair.proximal.tangential * slip_change;

@@ -30,6 +30,21 @@ double largest_of(const Buffer<double>& vectors) {
 
 }  // namespace
 
+void refuse_unknown(const SensitivityTerm& term, const Eigen::MatrixXd& mu, int sheets) {
+  using Kind = SensitivityTerm::Kind;
+  if (term.is_friction_of_pair()) {
+    const bool known = term.first >= 0 && term.second < mu.rows();
+    if (!known || !(mu(term.first, term.second) >= 0.0)) {
+      refuse(text("parameter: friction must be of two sheets, or of a sheet and a surface, that ",
+                  "touch each other, got ", term.first, " and ", term.second));
+    }
+    return;
+  }
+  const int sheet = term.is_friction_of_body() ? term.second : term.first;
+  if (sheet >= sheets)
+    refuse(text("parameter: must be of one of ", sheets, " sheets, got sheet ", sheet));
+}
+
 Sensitivities::Sensitivities(Assembly& assembly, Newton& newton, const ClothSettings& settings)
     : assembly_(assembly), newton_(newton), settings_(settings) {}
 
@@ -38,8 +53,8 @@ void Sensitivities::follow(const std::vector<SensitivityParameter>& parameters) 
   const Buffer<double> zero(4L * assembly_.numbering.nodes, 0.0);
   states_.assign(parameters.size(), {zero, zero, zero, zero, zero, zero, {}});
   report_ = {};
-  for (Buffer<double>* vectors : {&derivative_, &by_parameter_, &stiffness_change_, &pulled_,
-                                  &plus_, &minus_, &at_, &at_start_}) {
+  for (Buffer<double>* vectors : {&derivative_, &by_parameter_, &by_term_, &stiffness_change_,
+                                  &pulled_, &plus_, &minus_, &at_, &at_start_}) {
     *vectors = zero;
   }
   const std::size_t free_nodes = assembly_.numbering.free_nodes;
@@ -83,10 +98,6 @@ void Sensitivities::advance(const Step& step) {
     assembly_.use_convex_hessian = true;
   }
   bodies_ = static_cast<int>(step.at_end.size());
-  for (const SensitivityParameter& by : parameters_) {
-    if (by.kind == SensitivityParameter::Kind::friction_of_body && by.first >= bodies_)
-      refuse(text("parameter: friction must be of one of ", bodies_, " bodies, got ", by.first));
-  }
   classify_nodes(step);
   classify_pairs(step);
   ++report_.steps;
@@ -96,20 +107,33 @@ void Sensitivities::advance(const Step& step) {
 
 // The derivative of R by the parameter itself, with all positions and velocities as they are.
 void Sensitivities::by_parameter(int parameter, const Step& step) {
-  using Kind = SensitivityParameter::Kind;
   std::fill(by_parameter_.begin(), by_parameter_.end(), 0.0);
-  switch (parameters_[parameter].kind) {
+  for (const SensitivityTerm& term : parameters_[parameter]) {
+    differentiate_by(term, step);
+    // No energy joins two sheets, so the nodes of a sheet have its whole share.
+    for (int i = 0; i < assembly_.numbering.free_nodes; ++i) {
+      if (term.first < 0 || term.first == newton_.contact.sheet[i])
+        at_node(by_parameter_, i) += term.rate * at_node(by_term_, i);
+    }
+  }
+}
+
+// Sets `by_term_` to the derivative of R by a number of all sheets.
+void Sensitivities::differentiate_by(const SensitivityTerm& term, const Step& step) {
+  using Kind = SensitivityTerm::Kind;
+  std::fill(by_term_.begin(), by_term_.end(), 0.0);
+  switch (term.kind) {
     case Kind::bending:
-      assembly_.gradient_of(Assembly::Energy::bending, step.x, by_parameter_);
+      assembly_.gradient_of(Assembly::Energy::bending, step.x, by_term_);
       return;
     case Kind::stretching:
-      assembly_.gradient_of(Assembly::Energy::membrane, step.x, by_parameter_);
+      assembly_.gradient_of(Assembly::Energy::membrane, step.x, by_term_);
       return;
     case Kind::density: {
       const Inertia& inertia = step.inertia;
       for (int i = 0; i < assembly_.numbering.free_nodes; ++i) {
         const double viscous = (step.damping + assembly_.own_damping[i]) / inertia.span[i];
-        at_node(by_parameter_, i) =
+        at_node(by_term_, i) =
             assembly_.mass[i] *
             (inertia.rate[i] * (at_node(step.x, i) - at_node(inertia.target, i)) +
              viscous * (at_node(step.x, i) - at_node(inertia.origin, i)));
@@ -118,7 +142,8 @@ void Sensitivities::by_parameter(int parameter, const Step& step) {
     }
     case Kind::friction_of_body:
     case Kind::friction_of_pair:
-    case Kind::drive:  // contacts, and the prescribed points and accelerations, bring these in
+    case Kind::static_friction_of_body:
+    case Kind::static_friction_of_pair:  // contacts bring these in
       return;
   }
 }

@@ -31,19 +31,44 @@
 
 namespace sim_core {
 
-// What a run is differentiated by.
-struct SensitivityParameter {
+// A number of the cloth that a parameter changes, and by how much a unit of the parameter does.
+struct SensitivityTerm {
   enum class Kind : int {
     friction_of_body = 0,  // coefficient of body `first` with sheet `second` (-1: all sheets)
     friction_of_pair = 1,  // coefficient of sheets, or of a sheet and a surface, `first` < `second`
-    bending = 2,           // logarithm of a factor of the rigidity of all fabrics
-    stretching = 3,        // logarithm of a factor of the stiffness of all fabrics
-    density = 4,           // logarithm of a factor of the density of all fabrics
-    drive = 5,             // what moves held vertices, bodies and gravity: see DriveRates
+    bending = 2,           // logarithm of a factor of the rigidity of sheet `first` (-1: all)
+    stretching = 3,        // logarithm of a factor of the stiffness, likewise
+    density = 4,           // logarithm of a factor of the density, likewise
+    // The static coefficients of the first two, where they differ from the kinetic ones, which the
+    // first two are then. Only what holds depends on them: no position does until it slips.
+    static_friction_of_body = 5,
+    static_friction_of_pair = 6,
   };
   Kind kind;
   int first = -1, second = -1;
+  double rate = 1.0;  // per unit of the parameter
+
+  bool is_friction_of_body() const {
+    return kind == Kind::friction_of_body || kind == Kind::static_friction_of_body;
+  }
+  bool is_friction_of_pair() const {
+    return kind == Kind::friction_of_pair || kind == Kind::static_friction_of_pair;
+  }
+  // Whether a contact with this cone bears friction by the term.
+  bool is_of(Cone cone) const {
+    const bool is_static =
+        kind == Kind::static_friction_of_body || kind == Kind::static_friction_of_pair;
+    return is_static == (cone == Cone::resting);
+  }
 };
+
+// What a run is differentiated by: all that it changes in the cloth. What it moves is in
+// DriveRates.
+using SensitivityParameter = std::vector<SensitivityTerm>;
+
+// Refuses a term of a missing sheet, or of two things that do not touch. mu: of sheets and
+// surfaces, -1 where they do not touch.
+void refuse_unknown(const SensitivityTerm& term, const Eigen::MatrixXd& mu, int sheets);
 
 // Derivative of the pose of a body by a parameter.
 struct BodyRate {
@@ -158,11 +183,12 @@ class Sensitivities {
   double friction_rate(int parameter, int node, const NodeContact& contact) const;
   double mu_by_direction(int node, const NodeContact& contact, const Step& step,
                          const Eigen::Vector3d& turn) const;
-  bool is_parameter(int parameter, const Pair& pair) const;
+  double friction_rate(int parameter, const Pair& pair) const;
   static PairMotions motions_of(const Pair& pair, const Buffer<double>& vectors);
 
   void solve(int parameter, const Step& step);
   void by_parameter(int parameter, const Step& step);
+  void differentiate_by(const SensitivityTerm& term, const Step& step);
   void predict(const State& state, const DriveRates& rates, const Step& step);
   void differentiate_gradient(const State& state, const Step& step);
   void linearize(int parameter, const Step& step);
@@ -197,7 +223,7 @@ class Sensitivities {
   Buffer<float> normal_, direction_, coupling_, turning_, force_, correction_, solution_, image_,
       work_;
   Buffer<double> derivative_;  // d
-  Buffer<double> by_parameter_, stiffness_change_, pulled_, plus_, minus_, at_, at_start_;
+  Buffer<double> by_parameter_, by_term_, stiffness_change_, pulled_, plus_, minus_, at_, at_start_;
   const DriveRates no_rates_;
   int bodies_ = 0;  // in the step at hand
 };

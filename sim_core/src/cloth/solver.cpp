@@ -137,20 +137,9 @@ StepReport ClothSolver::step(double dt, const Points3& gravity, const Points3& h
 }
 
 void ClothSolver::follow(const std::vector<SensitivityParameter>& parameters) {
-  using Kind = SensitivityParameter::Kind;
-  const Eigen::MatrixXd& mu = impl_->materials.mu;
-  const int sheets = impl_->mesh.sheets;
-  for (const SensitivityParameter& by : parameters) {
-    if (by.kind == Kind::friction_of_body && by.second >= sheets) {
-      refuse(text("parameter: friction must be with one of ", sheets, " sheets, got sheet ",
-                  by.second));
-    }
-    if (by.kind != Kind::friction_of_pair) continue;
-    const bool known = by.first >= 0 && by.second < mu.rows();
-    if (!known || !(mu(by.first, by.second) >= 0.0)) {
-      refuse(text("parameter: friction must be of two sheets, or of a sheet and a surface, that ",
-                  "touch each other, got ", by.first, " and ", by.second));
-    }
+  for (const SensitivityParameter& parameter : parameters) {
+    for (const SensitivityTerm& term : parameter)
+      refuse_unknown(term, impl_->materials.mu, impl_->mesh.sheets);
   }
   impl_->stepper.sensitivities.follow(parameters);
 }
@@ -203,6 +192,8 @@ StepReport ClothSolver::advance(double& time, double event, const PrescribedMoti
 }
 
 Eigen::Vector3d ClothSolver::momentum_rate() const { return impl_->stepper.momentum_rate(); }
+
+Eigen::Vector3d ClothSolver::damping_force() const { return impl_->stepper.damping_force(); }
 
 Points3 ClothSolver::positions() const { return impl_->unload(impl_->stepper.x); }
 Points3 ClothSolver::velocities() const { return impl_->unload(impl_->stepper.velocities.at_end); }

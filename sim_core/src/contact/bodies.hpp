@@ -5,6 +5,8 @@
 #include <array>
 #include <vector>
 
+#include "contact/friction_cones.hpp"
+
 namespace sim_core {
 
 // At the end of a step. In its own axes a plane fills z < 0; a rounded body has all points within
@@ -18,10 +20,15 @@ struct Body {
   double radius;           // m
   Eigen::Vector3d origin;  // m
   Eigen::Matrix3d rotation;
+  std::vector<double> mu_static = {};  // as `mu`, and at least that; none: the same
 
   // Half of its least extent, m: infinite of a plane.
   double half_thickness() const;
-  double mu_of(int sheet) const { return mu.size() == 1 ? mu[0] : mu[sheet]; }
+  double mu_of(int sheet, Cone cone = Cone::sliding) const {
+    const std::vector<double>& by_sheet =
+        cone == Cone::resting && !mu_static.empty() ? mu_static : mu;
+    return by_sheet.size() == 1 ? by_sheet[0] : by_sheet[sheet];
+  }
 };
 
 // Signed distance of a point from a body [m], negative inside; the outward normal there, and

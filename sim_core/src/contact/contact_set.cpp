@@ -83,7 +83,8 @@ PairPast::PairPast(const Pair& pair)
       middle(pair.middle),
       thickness(pair.thickness),
       penalty_scale(pair.penalty_scale),
-      missed(violation(pair.contact, pair.row.mode)) {}
+      missed(violation(pair.contact, pair.row.mode)),
+      cone(pair.cone) {}
 
 PairMotions Pair::motions(const Buffer<float>& change, int free_nodes) const {
   PairMotions out = held_motions;
@@ -140,13 +141,16 @@ void ContactSet::store_history() {
     history_.emplace_back(pair);
     history_.back().change.setZero();
     history_.back().penalty_scale = 1.0;
+    if (has_static_) history_.back().cone = cone_after(pair.row.mode);
   }
+  if (has_static_) ended_ = history_;
 }
 
 void ContactSet::update(const Buffer<double>& x, double step_length, Buffer<double>& residual) {
   find(x);
   transfer(step_length);
   merge();
+  if (has_static_) choose_cones();
   linearize_at(x);
   for (const Pair& pair : pairs_) {
     if (pair.contact.force.isZero(0.0)) continue;

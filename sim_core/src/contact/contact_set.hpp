@@ -4,6 +4,7 @@
 #pragma once
 
 #include <Eigen/Core>
+#include <optional>
 #include <span>
 #include <vector>
 
@@ -40,6 +41,7 @@ struct Pair {
   Eigen::Vector3d change = Eigen::Vector3d::Zero();  // of the force in the last linear problem, N
   PairRow row{};
   double penalty_scale = 1.0;            // growth of its proximal stiffness in this attempt
+  std::optional<Cone> cone = {};         // of friction; none before it is chosen
   bool added = false, released = false;  // in the linear problem at hand, whatever the law says
 
   bool active() const { return row.mode != contact_open; }
@@ -72,7 +74,8 @@ struct PairPast {
   int feature, mode;
   Eigen::Vector3d force, change, normal, middle;
   double thickness, penalty_scale;
-  double missed;  // violation of its row, m; see `violation`
+  double missed;             // violation of its row, m; see `violation`
+  std::optional<Cone> cone;  // as of a pair
 
   PairPast(const Pair& pair);
 };
@@ -94,10 +97,15 @@ class ContactSet {
 
   // Forgets all forces.
   void restart();
+  // Forgets what slid, too: another state is set.
+  void forget_cones() { ended_.clear(); }
   // Begins an attempt at a step from `start`, with the forces kept last. Held nodes go to `ends`;
   // all nodes are `expected` where velocities lead. `own`: stiffness of the free nodes, N/m.
   void begin(const Buffer<double>& start, const Buffer<double>& ends,
              const Buffer<double>& expected, std::vector<Eigen::Matrix3d> own);
+  // After a step was solved: gives pairs the cones that hold now, and keeps their forces for the
+  // next look. Returns whether any changed.
+  bool switch_cones();
   // Keeps the forces at the end of a step for the next one.
   void store_history();
 
@@ -169,6 +177,10 @@ class ContactSet {
   void adopt(const PairPast& orphan, const Eigen::Vector3d& force,
              const std::vector<std::size_t>& fresh);
   void merge();
+  void choose_cones();
+  Cone cone_at_start(const Pair& pair);
+  Eigen::Vector3d expected_slip(const Pair& pair);
+  bool has_static(const Pair& pair) const;
   void linearize_at(const Buffer<double>& x);
 
   // A triangle whose closest point to a vertex lies on this feature.
@@ -182,11 +194,14 @@ class ContactSet {
   double least_distance_;
   std::vector<double> displacements_;  // of each node in the step but for a common one, m
   const Buffer<double>*start_ = nullptr, *ends_ = nullptr;
+  bool has_static_;          // whether friction of any two is larger while they rest
+  Buffer<double> expected_;  // (nodes, 4): where velocities lead, if so, m
   Turns turns_;
   std::vector<Eigen::Matrix3d> own_;
   std::vector<NearFeature> near_features_;       // of the vertex at hand
   std::vector<Pair> pairs_;                      // sorted by kind, first, feature
   std::vector<PairPast> base_, history_, best_;  // likewise
+  std::vector<PairPast> ended_;  // at the end of the last step, if friction is larger at rest
   PairArrays rows_;
 };
 

@@ -81,7 +81,8 @@ ContactSet::ContactSet(Surface surface, const ContactMaterials& materials_in, do
       materials(materials_in),
       free_nodes_(free_nodes),
       least_distance_(std::numeric_limits<double>::infinity()),
-      displacements_(near.surface.sheet_of_node.size()) {}
+      displacements_(near.surface.sheet_of_node.size()),
+      has_static_(materials_in.has_static()) {}
 
 void ContactSet::begin(const Buffer<double>& start, const Buffer<double>& ends,
                        const Buffer<double>& expected, std::vector<Matrix3d> own) {
@@ -90,6 +91,7 @@ void ContactSet::begin(const Buffer<double>& start, const Buffer<double>& ends,
   turns_.begin(start, expected, free_nodes_);
   own_ = std::move(own);
   base_ = history_;
+  if (has_static_) expected_ = expected;
 }
 
 void ContactSet::find(const Buffer<double>& x) {

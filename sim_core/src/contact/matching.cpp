@@ -53,6 +53,7 @@ void ContactSet::transfer(double step_length) {
 void ContactSet::inherit(Pair& pair, const PairPast& past, double step_length) const {
   pair.contact.force = past.force + step_length * past.change;
   pair.penalty_scale = past.penalty_scale;
+  pair.cone = past.cone;
   const double now = violation(pair.contact, past.mode);
   const bool is_exact = smoothing == 0.0 && step_length == 1.0 && past.mode != contact_open;
   const bool was_near =
@@ -130,6 +131,60 @@ void ContactSet::merge() {
   }
   std::size_t i = 0;
   std::erase_if(pairs_, [&](const Pair&) { return gone[i++] != 0; });
+}
+
+bool ContactSet::has_static(const Pair& pair) const {
+  const std::vector<int>& sheet_of_node = near.surface.sheet_of_node;
+  return materials.has_static(sheet_of_node[pair.stencil.node[0]],
+                              sheet_of_node[pair.stencil.node[3]]);
+}
+
+// Slip by which velocities lead, m.
+Vector3d ContactSet::expected_slip(const Pair& pair) {
+  const Vector3d way = between_closest(pair.weights, points_of(pair.stencil, expected_)) -
+                       turn_of(pair.stencil, pair.weights) *
+                           between_closest(pair.weights, points_of(pair.stencil, *start_));
+  const Vector3d& n = pair.contact.normal;
+  return way - way.dot(n) * n;
+}
+
+// That of the same pair at the start of the step, or else of one that had a piece of it.
+Cone ContactSet::cone_at_start(const Pair& pair) {
+  const PairPast* match = nullptr;
+  double most_alike = pairs::match_cosine;
+  for (const PairPast& past : ended_) {
+    if (key(past) == key(pair)) return *past.cone;
+    if (!have_common_piece(past.stencil, pair.stencil)) continue;
+    const double alike = pair.contact.normal.dot(past.normal);
+    if (alike > most_alike) most_alike = alike, match = &past;
+  }
+  return match ? *match->cone : cone_of_new(expected_slip(pair));
+}
+
+void ContactSet::choose_cones() {
+  const std::vector<int>& sheet_of_node = near.surface.sheet_of_node;
+  for (Pair& pair : pairs_) {
+    if (!has_static(pair)) continue;
+    if (!pair.cone) pair.cone = cone_at_start(pair);
+    pair.contact.mu = materials.friction(sheet_of_node[pair.stencil.node[0]],
+                                         sheet_of_node[pair.stencil.node[3]], *pair.cone);
+  }
+}
+
+bool ContactSet::switch_cones() {
+  bool any = false;
+  if (!has_static_) return any;
+  for (Pair& pair : pairs_) {
+    if (!pair.cone || !has_static(pair)) continue;
+    const Cone next =
+        next_cone(*pair.cone, pair.row.mode, pair.contact.slip.dot(expected_slip(pair)));
+    any = any || next != *pair.cone;
+    pair.cone = next;
+  }
+  if (!any) return any;
+  mark_best();
+  return_to_best();
+  return any;
 }
 
 }  // namespace sim_core

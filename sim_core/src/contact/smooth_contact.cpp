@@ -153,8 +153,8 @@ Matrix3d SmoothContact::turn(int node) const {
          patches_.axes(start_, projection.triangle, projection.weights).transpose();
 }
 
-double SmoothContact::mu(int node) const {
-  return materials_.mu(sheet_of_node_[node], surface_of(projections_[node].triangle));
+double SmoothContact::mu(int node, Cone cone) const {
+  return materials_.friction(sheet_of_node_[node], surface_of(projections_[node].triangle), cone);
 }
 
 Vector3d SmoothContact::normal_near(int node, const Vector3d& p) const {

@@ -82,7 +82,8 @@ ContactState::ContactState(int free_nodes)
       coupling(free_nodes, 0.0f),
       turning(free_nodes, 0.0f),
       force(4 * free_nodes + 64, 0.0f),
-      correction(4 * free_nodes + 64, 0.0f) {}
+      correction(4 * free_nodes + 64, 0.0f),
+      cone(free_nodes, Cone::sliding) {}
 
 ContactRows ContactState::rows() const {
   return {mode.data(), normal.data(), direction.data(), coupling.data(), turning.data()};
@@ -176,6 +177,7 @@ ForceNorms ContactState::classify_contacts(const Buffer<double>& x, const Buffer
     }
     const bool slipped = mode[i] == contact_slip && touched[i] == on.body;
     touched[i] = on.body;
+    if (resting_.applies) choose_cone(i, on, x, start, at_start, at_end);
     const Contact contact = contact_at(i, on, x, start, residual, at_start, at_end);
     const LawResponse law = coulomb_law(contact);
     const bool reversed = slipped && law.mode == contact_slip &&
@@ -190,12 +192,21 @@ ForceNorms ContactState::classify_contacts(const Buffer<double>& x, const Buffer
 
 void ContactState::store_history(double dt) {
   history_ = {mode, touched, direction, turning, dt};
+  if (resting_.applies) {
+    resting_.mode = mode;
+    resting_.touched = touched;
+  }
   if (surfaces) surfaces->store_history(mode);
 }
 
 void ContactState::clear_history() {
   history_.dt = 0.0;
   if (surfaces) surfaces->restart();
+}
+
+void ContactState::restart() {
+  clear_history();
+  resting_.mode.clear();
 }
 
 bool ContactState::warm_start(const Buffer<double>& x, const Buffer<double>& start,
@@ -214,6 +225,7 @@ bool ContactState::warm_start(const Buffer<double>& x, const Buffer<double>& sta
       if (!one) continue;
       on = {{one->gap, one->normal}, body};
     }
+    if (resting_.applies) choose_cone(node, on, x, start, at_start, at_end);
     const Contact contact = contact_at(node, on, x, start, residual, at_start, at_end);
     touched[i] = body;
     at_node(normal, node) = on.gap.normal.cast<float>();
@@ -243,9 +255,7 @@ Contact ContactState::contact_at(int node, const BodyContact& on, const Buffer<d
   const Vector3d before = at_node(start, node);
   const Vector3d p = at_node(x, node);
   const Vector3d& n = on.gap.normal;
-  const bool on_surface = on.body >= static_cast<int>(at_end.size());
-  Vector3d u = on_surface ? surfaces->slip(node, before, p) : slip(on, before, p, at_start, at_end);
-  if (on_surface) u -= u.dot(n) * n;
+  const Vector3d u = slip_to(node, on, before, p, at_start, at_end);
   const Vector3d pressing = press(on, node);
   const Vector3d force = at_node(residual, node) - pressing;
   Contact out{on.gap.distance, n, u, force, 0.0, stiffness[node], pressing.norm()};
@@ -261,8 +271,9 @@ FrictionCoefficient ContactState::mu_at(int node, const BodyContact& on, const V
                                         const Vector3d& friction,
                                         const std::vector<Body>& at_end) const {
   const bool on_surface = on.body >= static_cast<int>(at_end.size());
-  const double mu = on_surface ? surfaces->mu(node)
-                               : on.average([&](int b) { return at_end[b].mu_of(sheet[node]); });
+  const double mu =
+      on_surface ? surfaces->mu(node, cone[node])
+                 : on.average([&](int b) { return at_end[b].mu_of(sheet[node], cone[node]); });
   const bool turns = on_surface || (at_end[on.body].shape != Body::plane && on.neighbours[0] < 0 &&
                                     on.opposite < 0);
   const double size = friction.norm();

@@ -12,6 +12,7 @@
 #include "contact/bodies.hpp"
 #include "contact/capstan.hpp"
 #include "contact/closest.hpp"
+#include "contact/friction_cones.hpp"
 #include "contact/linearized_contact.hpp"
 #include "contact/pn_triangles.hpp"
 #include "contact/rows.hpp"
@@ -63,7 +64,8 @@ class SmoothContact {
   // Of what the node saw last: its way over the surface since it was at `before` when the step
   // began, m; friction; and the projection.
   Eigen::Vector3d slip(int node, const Eigen::Vector3d& before, const Eigen::Vector3d& p) const;
-  double mu(int node) const;
+  double mu(int node, Cone cone) const;
+  bool has_static() const { return materials_.has_static(); }
   // By which the surface turned in the step where the node saw it last.
   Eigen::Matrix3d turn(int node) const;
   // The normal at p, which is near what the node saw last: that one where there is no projection.
@@ -150,6 +152,8 @@ class ContactState {
   Buffer<float> force,
       correction;  // (free nodes, 4): the right-hand side, N, and what contact prescribes, m
 
+  std::vector<Cone> cone;  // (free nodes): of friction with what they touch
+
   std::unique_ptr<SmoothContact> surfaces;  // null if there are none
 
   // Whether nodes whose friction turns back from one iterate to the next stick in the linear
@@ -169,6 +173,8 @@ class ContactState {
                               const Eigen::Vector3d& p, const std::vector<Body>& at_start,
                               const std::vector<Body>& at_end);
 
+  // Begins an attempt at a step that velocities are `expected` to lead there.
+  void begin(const Buffer<double>& expected, const std::vector<Body>& at_end);
   // Classifies the contacts of the free nodes at `x`, which were at `start` when the step began and
   // need `residual` from contact.
   ForceNorms classify_contacts(const Buffer<double>& x, const Buffer<double>& start,
@@ -181,9 +187,13 @@ class ContactState {
   bool warm_start(const Buffer<double>& x, const Buffer<double>& start,
                   const Buffer<double>& residual, const std::vector<Body>& at_start,
                   const std::vector<Body>& at_end, double dt);
+  // After a step was solved: gives contacts the cones that hold now. Returns whether any changed.
+  bool switch_cones();
   // Keeps the modes, directions and stiffnesses of a step that ended, for the next; or none.
   void store_history(double dt);
   void clear_history();
+  // Forgets what slid, too: another state is set.
+  void restart();
 
   ContactRows rows() const;
 
@@ -203,6 +213,15 @@ class ContactState {
 
  private:
   void write(int node, const NodeRow& row);
+  // Sets the cone of a node on a body that it did not touch at the iterate before.
+  void choose_cone(int node, const BodyContact& on, const Buffer<double>& x,
+                   const Buffer<double>& start, const std::vector<Body>& at_start,
+                   const std::vector<Body>& at_end);
+  bool has_static(int node, const BodyContact& on, const std::vector<Body>& at_end) const;
+  // Slip between two places of a node, in the plane of contact, m.
+  Eigen::Vector3d slip_to(int node, const BodyContact& on, const Eigen::Vector3d& before,
+                          const Eigen::Vector3d& p, const std::vector<Body>& at_start,
+                          const std::vector<Body>& at_end) const;
 
   struct History {
     std::vector<int> mode, touched;
@@ -210,6 +229,17 @@ class ContactState {
     double dt = 0.0;  // 0: nothing is kept
   };
   History history_;
+
+  // Of static friction, where any body or surface has it.
+  struct Resting {
+    bool applies = false;
+    const Buffer<double>* expected = nullptr;
+    // (free nodes): where the last step ended, as `mode` and `touched`.
+    std::vector<int> mode, touched;
+    std::vector<int> of;         // (free nodes): the body for which the cone stands; -1: none
+    std::vector<double> onward;  // (free nodes): slip times the way by velocities, m^2
+  };
+  Resting resting_;
 };
 
 }  // namespace sim_core

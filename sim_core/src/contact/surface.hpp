@@ -9,6 +9,7 @@
 
 #include "contact/closest.hpp"
 #include "contact/constants.hpp"
+#include "contact/friction_cones.hpp"
 #include "math/buffer.hpp"
 
 namespace sim_core {
@@ -23,7 +24,14 @@ struct ContactMaterials {
   // the earlier sheet's vertices: the active set is not unique and changes all the time. With less
   // than 1 they are active where cloth is curved only.
   double edge_fraction = 1.0, second_fraction = 1.0;
+  Eigen::MatrixXd mu_static = {};  // as `mu`, and at least that; empty: the same
 
+  double friction(int a, int b, Cone cone) const {
+    return cone == Cone::resting && mu_static.size() > 0 ? mu_static(a, b) : mu(a, b);
+  }
+  // Whether friction of these two, or of any two, is larger while they rest.
+  bool has_static(int a, int b) const { return mu_static.size() > 0 && mu_static(a, b) > mu(a, b); }
+  bool has_static() const { return mu_static.size() > 0 && (mu_static.array() > mu.array()).any(); }
   double mean(int a, int b) const { return 0.5 * (thickness[a] + thickness[b]); }
   // Distance that pairs of closest points keep, m. Nodes touch surfaces by themselves
   // (contact/state.hpp): pairs only hold what comes nearer between the nodes.

@@ -3,6 +3,7 @@ by vertex.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -196,8 +197,13 @@ class TestCloth:
         return cloth
 
     def test_agrees_with_a_round_sphere(self) -> None:
-        """More so the finer the triangles."""
-        round_one = Cloth(SHEET, STIFF, CERTIFIED)
+        """More so the finer the triangles.
+
+        With one scheme for all vertices: of second order, one that lands a little later takes
+        another way, and shapes are not all that differs.
+        """
+        settings = replace(CERTIFIED, second_order=False)
+        round_one = Cloth(SHEET, STIFF, settings)
         start = np.column_stack([SHEET.rest, np.full(len(SHEET.rest), self.R + 2.0 * THICKNESS)])
         round_one.set_state(start)
         tilt = tilted(0.1)
@@ -208,7 +214,7 @@ class TestCloth:
         off = []
         for subdivisions in (2, 3, 4):
             x, triangles = ball(self.R, subdivisions)
-            cloth = Cloth(SHEET, STIFF, CERTIFIED, surfaces=[Surface(triangles, x, 0.05)])
+            cloth = Cloth(SHEET, STIFF, settings, surfaces=[Surface(triangles, x, 0.05)])
             cloth.set_state(start)
             cloth.gravity[:] = tilt
             for _ in range(40):
@@ -228,12 +234,15 @@ class TestCloth:
     def test_momentum(self) -> None:
         """What the cloth bears, the surface bears with the other sign."""
         cloth = self.settled(0.5)
-        assert (cloth.contacts >= 0).any()
-        on_cloth = cloth.reactions.sum(axis=0)
+        touching = cloth.contacts >= 0
+        assert touching.any()
+        on_cloth = cloth.reactions[touching].sum(axis=0)
         assert cloth.surface_forces[0].sum(axis=0) == pytest.approx(
             -on_cloth, abs=1e-12 * np.abs(on_cloth).max()
         )
-        assert cloth.contact_force() == pytest.approx(on_cloth, abs=1e-12 * np.abs(on_cloth).max())
+        # The balance has the residuals of vertices that touch nothing, too.
+        balance = cloth.reactions.sum(axis=0)
+        assert cloth.contact_force() == pytest.approx(balance, abs=1e-12 * np.abs(balance).max())
 
     def test_does_not_creep_within_the_cone(self) -> None:
         """At nine tenths of the steepest slope that its whole way downhill can bear."""
@@ -313,14 +322,16 @@ class TestCloth:
         """Vertices keep 6 mm from the ball, and coarse triangles are up to 7 mm below it: nodes
         must find them.
         """
-        soft, heights = isotropic(0.2, 200.0, 2e-6), []
+        soft, heights, touching = isotropic(0.2, 200.0, 2e-6), [], []
         for subdivisions in (1, 3):
             x, triangles = ball(0.1, subdivisions)
             cloth = over(Surface(triangles, x, 0.5), 0.12, meshes.grid(0.36, 0.36, 8, 8), soft)
-            for _ in range(60):
+            for _ in range(150):
                 cloth.step(0.01, damping=10.0)
-            assert np.count_nonzero(cloth.contacts >= 0) == 25
+            touching.append(cloth.contacts >= 0)
             heights.append(cloth.positions)
+        assert np.count_nonzero(touching[0]) > 15
+        assert np.array_equal(touching[0], touching[1])
         assert heights[0] == pytest.approx(heights[1], abs=1e-3)
 
     def test_what_starts_nearer_than_it_may_be_is_not_thrown_off(self) -> None:

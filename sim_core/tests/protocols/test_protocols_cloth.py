@@ -200,12 +200,11 @@ class TestMotion:
         assert not protocols.run(name).passed
 
     @pytest.mark.parametrize("preset", ["fast", "certified", "fine"])
-    def test_a_swing_of_second_order_passes(self, preset: str) -> None:
-        settings = replace(PRESETS[preset], second_order=True)
-        assert oscillation.Swing(preset=settings).run().passed
+    def test_a_swing_passes(self, preset: str) -> None:
+        assert protocols.run("swing", preset).passed
 
     def test_the_swing_fails_where_the_scheme_damps_it(self) -> None:
-        result = oscillation.Swing(preset=CERTIFIED).run()
+        result = oscillation.Swing(preset=replace(CERTIFIED, second_order=False)).run()
         assert not result.passed
         assert result.error > 0.1
 
@@ -226,6 +225,8 @@ class TestPresets:
         always = {
             "fall",
             "slide-to-rest",
+            "static-onset",
+            "kinetic-slide",
             "impact",
             "gripper",
             "stick-slip",
@@ -241,10 +242,10 @@ class TestPresets:
             "heavy-fold",
             "stacked-incline",
             "pull-out",
+            "swing",
         }
         expected = always if preset.startswith("thesis-") else always | of_scenes
-        swings = {"swing"} if preset == "fine" else set()
-        assert set(certification.protocols) == expected | swings
+        assert set(certification.protocols) == expected
         assert certification.numbers()["time_step"] == PRESETS[preset].time_step
 
     @pytest.mark.parametrize(

@@ -115,7 +115,7 @@ def test_a_step_that_may_not_fail_is_given_up() -> None:
 
 def _iterations(scene: Scene, *, may_fail: bool) -> int:
     """Return the iterations up to the first step that does not converge, with all of its own."""
-    _, cloth = scene.begin()
+    cloth = scene.begin().cloth
     cloth.advance(
         0.1,
         lambda time: (cloth.gravity, np.empty((0, 3)), scene.motion(time)[1]),

@@ -133,7 +133,7 @@ def test_a_dataset_outside_of_the_weights_is_refused(make_clips):
     message = " ".join(result.stderr.split())
     mesh = coarse.spec.mesh
     assert (
-        f"know: mesh {mesh} (known: 41 and finer), preset fast (known: certified, fine)." in message
+        f"know: mesh {mesh} (known: 41 and finer), preset fast (known: certified, fine)" in message
     )
     assert "examples/friction-cloth.yaml" in message
     assert "--model" in message
@@ -141,10 +141,14 @@ def test_a_dataset_outside_of_the_weights_is_refused(make_clips):
 
 def test_the_scope_names_materials_and_friction_that_are_unknown(clips):
     scope = package_scope(("gray-interlock", "11oz-black-denim"))
-    spec = clips.spec.model_copy(update={"mesh": 41, "preset": "certified"})
+    known = {"mesh": 41, "preset": "certified", "quality": "draft"}
+    spec = clips.spec.model_copy(update=known)
     assert scope.outside(spec, {"gray-interlock"}, 1.6) == []
     scope.check(spec, {"gray-interlock"}, 1.6)
     assert scope.outside(spec, {"gray-interlock", "felt", "canvas"}, 2.0) == [
         "material canvas, felt (known: gray-interlock, 11oz-black-denim)",
         "mu 2 (known: 0 to 1.6)",
     ]
+    # The renderer of other qualities was in no test of the network.
+    untested = spec.model_copy(update={"quality": "high"})
+    assert scope.outside(untested, set(), 0.0) == ["quality high (known: draft, standard)"]

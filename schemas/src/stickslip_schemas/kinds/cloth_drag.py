@@ -4,7 +4,7 @@ The rig `drag` films it.
 """
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -27,6 +27,7 @@ from stickslip_schemas.kinds.cloth.spec import (
     TextureAxis,
     definitions,
 )
+from stickslip_schemas.scene.parameters import refuse
 from stickslip_schemas.spec.arrays import ArrayLayout, array
 from stickslip_schemas.spec.axes import (
     SHORTHAND,
@@ -36,6 +37,7 @@ from stickslip_schemas.spec.axes import (
     RandomAxis,
     Seed,
     SobolAxis,
+    extremes,
     quantity,
 )
 from stickslip_schemas.spec.cameras import Camera, load_rig, rig_cameras, rig_digest
@@ -56,9 +58,17 @@ VIEWPOINTS = tuple(camera.name for camera in load_rig(RIG))
 what it looks at by 5, 10 and 15 degrees to all sides [thesis, 4.5.1]. Their order gives the codes
 of the label `viewpoint`."""
 
+FRICTION_MAX = 10.0
+"""Largest coefficient of friction."""
+
 # Types of values have names of their own, which the JSON schema shows.
 Mu = Annotated[
     float, quantity("Mu"), Field(strict=True, ge=0, le=10, description="friction coefficient")
+]
+StaticRatio = Annotated[
+    float,
+    quantity("StaticRatio"),
+    Field(strict=True, ge=1, le=3, description="static over kinetic coefficient of friction"),
 ]
 Factor = Annotated[
     float,
@@ -67,6 +77,14 @@ Factor = Annotated[
 ]
 MuAxis = Annotated[
     ListAxis[Mu] | LinspaceAxis[Mu] | RandomAxis[Mu] | SobolAxis[Mu], TAGGED, SHORTHAND
+]
+StaticRatioAxis = Annotated[
+    ListAxis[StaticRatio]
+    | LinspaceAxis[StaticRatio]
+    | RandomAxis[StaticRatio]
+    | SobolAxis[StaticRatio],
+    TAGGED,
+    SHORTHAND,
 ]
 FactorAxis = Annotated[
     ListAxis[Factor] | LinspaceAxis[Factor] | RandomAxis[Factor] | SobolAxis[Factor],
@@ -93,6 +111,11 @@ class ClothDragAxes(Document):
         "distribution that draws many"
     )
     mu: MuAxis = Field(description="friction coefficient between cloth and floor")
+    static_ratio: StaticRatioAxis | None = Field(
+        default=None,
+        description="static over kinetic friction coefficient between cloth and floor; `mu` is "
+        "then the kinetic one",
+    )
     density: FactorAxis | None = Field(
         default=None, description="factor of the fabric's mass per area"
     )
@@ -111,7 +134,7 @@ class ClothDragAxes(Document):
     )
 
 
-PHYSICAL_AXES = ("material", "mu", "density", "bending", "stretching")
+PHYSICAL_AXES = ("material", "mu", "static_ratio", "density", "bending", "stretching")
 """The axes that a trajectory depends on."""
 
 
@@ -127,6 +150,8 @@ class ClothDragSimulation(Simulation):
     bending: float = 1.0
     stretching: float = 1.0
     mu: float
+    # Left out, the keys of simulations without it are those of builds that did not have it.
+    static_ratio: float = Field(default=1.0, exclude_if=lambda ratio: ratio == 1.0)
     preset: PresetName
     mesh: int
     frames: int
@@ -208,6 +233,18 @@ class ClothDragSpec(ClipSpec):
     def _draw_fabrics(cls, document: Any) -> Any:
         return with_drawn_material(document)
 
+    @model_validator(mode="after")
+    def _static_friction_in_range(self) -> Self:
+        ratio = self.axes.static_ratio
+        if ratio is None:
+            return self
+        largest = max(value for _, value in extremes(self.axes.mu))
+        for place, value in extremes(ratio):
+            if value * largest > FRICTION_MAX:
+                rule = f"times the largest mu, {largest:g}, must be at most {FRICTION_MAX:g}"
+                refuse(self, ("axes", "static_ratio", *place), rule, value)
+        return self
+
     def key_value(self, axis: str, value: Any) -> Any:
         card = self.materials.get(value) if axis == "material" else None
         return value if card is None else card.identity
@@ -275,10 +312,10 @@ class ClothDragSpec(ClipSpec):
             # Clips and looks, then the physics, its checks, forces and motion.
             *clip_arrays(self),
             codes("material", self.names("material")),
-            array("mu", "friction coefficient"),
+            array("mu", "friction coefficient; the kinetic one where there is `static_ratio`"),
             *(
                 array(name, descriptions[name])
-                for name in ("density", "bending", "stretching")
+                for name in ("static_ratio", "density", "bending", "stretching")
                 if name in self.named_axes
             ),
             *fabric_arrays(),

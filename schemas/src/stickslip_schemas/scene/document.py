@@ -59,7 +59,44 @@ class Pair(Document):
     """The friction of two things: two sheets, a sheet and a body, or a sheet with itself."""
 
     between: tuple[CustomName, CustomName]
-    mu: Friction = Field(description="coefficient of friction")
+    mu: Friction | None = Field(
+        default=None,
+        exclude_if=lambda mu: mu is None,
+        description="coefficient of friction, at rest and sliding; or `static` and `kinetic`",
+    )
+    static: Friction | None = Field(
+        default=None,
+        exclude_if=lambda mu: mu is None,
+        description="coefficient of friction up to which what rests holds, `kinetic` or more",
+    )
+    kinetic: Friction | None = Field(
+        default=None,
+        exclude_if=lambda mu: mu is None,
+        description="coefficient of friction of what slides",
+    )
+
+    @property
+    def sliding(self) -> float:
+        """The kinetic coefficient."""
+        coefficient = self.kinetic if self.mu is None else self.mu
+        assert coefficient is not None
+        return coefficient
+
+    @model_validator(mode="after")
+    def _mu_or_both(self) -> Self:
+        both = (self.static, self.kinetic)
+        if self.mu is not None:
+            if both != (None, None):
+                raise ValueError("must have mu alone, or static and kinetic without mu")
+            return self
+        if self.static is None or self.kinetic is None:
+            raise ValueError("must have mu, or both static and kinetic")
+        # What rests would hold less than what slides.
+        if self.kinetic > self.static:
+            raise ValueError(
+                f"kinetic must be at most static, and {self.kinetic:g} is above {self.static:g}"
+            )
+        return self
 
 
 class Bias(Document):
@@ -149,10 +186,10 @@ class Physics(Document):
                 yield sheet, body
 
     def mu(self, first: str, second: str) -> float:
-        """Return the coefficient of friction of two things that may touch."""
+        """Return the coefficient of friction of two things that slide on each other."""
         for pair in self.friction:
             if set(pair.between) == {first, second}:
-                return pair.mu
+                return pair.sliding
         # The document has been checked: a pair without a coefficient has the default one.
         assert self.default_friction is not None
         return self.default_friction

@@ -17,25 +17,22 @@ import numpy as np
 import numpy.typing as npt
 
 from stickslip_schemas.base import ARTIFACT, sha256
-from stickslip_schemas.scene.document import MAX_VERTICES, Physics, Scene
+from stickslip_schemas.scene.document import Physics, Scene
 from stickslip_schemas.scene.errors import UnfitFileError as UnfitFileError
-from stickslip_schemas.scene.gate import MAX_TRIANGLES, check_file, is_path_table
+from stickslip_schemas.scene.gate import Arrays, SceneBytes, check_file, is_path_table
 from stickslip_schemas.scene.mesh_files import FARTHEST, Polygons, has_order, read_polygons
 from stickslip_schemas.scene.parameters import Location, value_at, with_values
 from stickslip_schemas.scene.parts import LARGEST, SMALLEST, MeshBody, unit_hint
-from stickslip_schemas.scene.polygons import Floats, Indices, repeated_numbers, triangulate, weld
+from stickslip_schemas.scene.polygons import Floats, triangulate, weld
 from stickslip_schemas.scene.reading import read_once
+from stickslip_schemas.scene.surface_rules import check_areas, check_corners, check_edges
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl")
 """Ends of the names of mesh files."""
 
-FLATTEST = 1e-12
-"""Least height of a triangle [m]."""
-
 PATH_COLUMNS = ("time", "x", "y", "z", "rx", "ry", "rz")
 """Columns of a motion in a CSV file: [s], [m], [rad]."""
 
-Arrays = dict[str, npt.NDArray[Any]]
 
 _Shapes = dict[str, tuple[str | int, ...]]
 _MESH: _Shapes = {"triangles": ("triangle", 3), "times": ("frame",)}
@@ -56,13 +53,14 @@ def inlined(scene: Scene, read: Callable[[str], bytes]) -> tuple[Scene, dict[str
     """
     values: dict[Location, Any] = {}
     files: dict[str, bytes] = {}
+    read_counted = SceneBytes(read_file).read
     for location, name in scene.files():
         if name.startswith(ARTIFACT):
             continue
         try:
             data = read(name)
             # Textures are checked by `format.pictures`, which needs another extra.
-            arrays = {} if location[0] == "looks" else read_file(location, data)
+            arrays = {} if location[0] == "looks" else read_counted(location, data)
             counts = _pattern_counts(location, arrays)
         except UnfitFileError as error:
             raise UnfitFileError(f"{_dotted(location)}: {error}, in {name}") from error
@@ -84,8 +82,9 @@ def with_arrays(physics: Physics, read: Callable[[str], bytes]) -> dict[str, Any
     `read` returns the bytes of an artifact by its digest. Raises UnfitFileError.
     """
     arrays = {}
+    read_counted = SceneBytes(read_file).read
     for location, name in Physics.files(physics):
-        arrays[location] = read_file(location, read(name.removeprefix(ARTIFACT)))
+        arrays[location] = read_counted(location, read(name.removeprefix(ARTIFACT)))
     document = physics.model_dump(mode="json", include=set(Physics.model_fields))
     with_files: dict[str, Any] = with_values(document, arrays)
     return with_files
@@ -195,8 +194,8 @@ def _read_pattern(data: bytes) -> Arrays:
             f"all triangles of the flat pattern must have areas above 0 m^2; {triangle} has "
             f"{area[triangle]:g}: triangles must be turned counterclockwise in the pattern"
         )
-    _check_corners(triangles)
-    _check_edges(triangles, len(rest))
+    check_corners(triangles)
+    check_edges(triangles, len(rest))
     if len(np.unique(triangles)) != len(rest):
         loose = int(np.setdiff1d(np.arange(len(rest)), triangles)[0])
         raise UnfitFileError(
@@ -244,11 +243,11 @@ def _read_body(data: bytes) -> _Body:
             "times": np.zeros(1),
         }
     # Before the weld, which gives a triangle without an area a vertex twice.
-    _check_corners(arrays["triangles"])
-    _check_areas(_first_positions(arrays), arrays["triangles"])
+    check_corners(arrays["triangles"])
+    check_areas(_first_positions(arrays), arrays["triangles"])
     body = _weld_body(arrays)
     positions = _first_positions(body.arrays)
-    _check_edges(body.arrays["triangles"], len(positions))
+    check_edges(body.arrays["triangles"], len(positions))
     _check_extent(positions)
     return body
 
@@ -311,60 +310,6 @@ def _check_extent(positions: Floats) -> None:
     if not SMALLEST <= extent <= LARGEST:
         raise UnfitFileError(
             f"must be {SMALLEST:g} to {LARGEST:g} m across, and is {extent:g} m{unit_hint(extent)}"
-        )
-
-
-def _check_corners(triangles: Indices) -> None:
-    names_twice = (triangles == np.roll(triangles, 1, axis=1)).any(axis=1)
-    if names_twice.any():
-        raise UnfitFileError(
-            "a triangle must have three vertices, and triangle "
-            f"{int(np.argmax(names_twice))} names one twice"
-        )
-
-
-def _check_edges(triangles: Indices, vertices: int) -> None:
-    """Raise UnfitFileError if triangles are not the surface of a manifold, turned alike.
-
-    At most two triangles share an edge, and each runs along it in another direction.
-    """
-    if vertices > MAX_VERTICES or len(triangles) > MAX_TRIANGLES:
-        raise UnfitFileError(
-            f"must have at most {MAX_VERTICES} vertices and {MAX_TRIANGLES} triangles, and has "
-            f"{vertices} and {len(triangles)}"
-        )
-    # One number for each row: sorting rows takes ten times as long.
-    a, b, c = np.sort(triangles, axis=1).T
-    numbers = (a * vertices + b) * vertices + c
-    repeated = repeated_numbers(numbers)
-    if len(repeated):
-        raise UnfitFileError(
-            f"each triangle must be there once, and {len(repeated)} repeat another one, such as "
-            f"triangle {int(np.argmax(numbers == repeated[0]))}: delete them (in Blender: merge "
-            "vertices by distance)"
-        )
-    edges = triangles * vertices + np.roll(triangles, -1, axis=1)
-    repeated = np.unique(repeated_numbers(edges.ravel()))
-    if len(repeated):
-        raise UnfitFileError(
-            "must be a manifold: at most two triangles share an edge, turned alike; "
-            f"{len(repeated)} edges are not so: turn all faces to one side (in Blender: Mesh, "
-            "Normals, Recalculate Outside), and delete faces inside"
-        )
-
-
-def _check_areas(vertices: Floats, triangles: Indices) -> None:
-    a = vertices[triangles[:, 0]]
-    b = vertices[triangles[:, 1]]
-    c = vertices[triangles[:, 2]]
-    # The height over the first edge, |ab x ac| / |ab|, has a unit that a limit can have.
-    doubled = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    length = np.linalg.norm(b - a, axis=1)
-    flat = doubled <= FLATTEST * np.maximum(length, np.finfo(float).tiny)
-    if flat.any():
-        raise UnfitFileError(
-            f"all triangles must have areas above 0 m^2, and triangle {int(np.argmax(flat))} has "
-            "none: delete such triangles (in Blender: Mesh, Clean Up, Degenerate Dissolve)"
         )
 
 

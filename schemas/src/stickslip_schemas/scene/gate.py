@@ -11,10 +11,14 @@ import re
 import struct
 import zipfile
 import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from itertools import pairwise
 from math import prod
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from stickslip_schemas.scene.document import MAX_VERTICES
 from stickslip_schemas.scene.errors import UnfitFileError
@@ -26,11 +30,17 @@ from stickslip_schemas.scene.mesh_files import (
     obj_text,
     read_ply_header,
 )
+from stickslip_schemas.scene.parameters import Location
 from stickslip_schemas.scene.plain_obj import Words
 from stickslip_schemas.scene.polygons import MAX_CORNERS, Indices
 
 MAX_FILE_BYTES = 16 * 2**20
 """Largest file of a scene, and largest sum of the arrays of an NPZ file [bytes]."""
+
+MAX_SCENE_BYTES = 24 * 2**20
+"""Largest sum of the files of a scene, or of their arrays if that is more [bytes].
+
+To read so many takes about a second of CPU time."""
 
 MAX_TRIANGLES = 2 * MAX_VERTICES
 """Triangles of one mesh: a closed surface has about two for each vertex."""
@@ -92,6 +102,40 @@ _FACE = re.compile(rb"^[ \t]*f[ \t\x0b]([^\n]*)", re.MULTILINE)
 _COMMENTS = re.compile(rb"#[^\n]*")
 _FACET = re.compile(rb"\bendfacet\b", re.IGNORECASE)
 _PATH_TABLE = re.compile(rb"(?:\xef\xbb\xbf)?[ \t]*\"?time\b", re.IGNORECASE)
+
+
+Arrays = dict[str, npt.NDArray[Any]]
+"""Arrays of a file, by name."""
+
+
+@dataclass
+class SceneBytes:
+    """Counts the bytes of the files of a scene: each has a limit, and a scene may name hundreds."""
+
+    read_file: Callable[[Location, bytes], Arrays]
+    sizes: dict[bytes, int] = field(default_factory=dict)
+
+    def read(self, location: Location, data: bytes) -> Arrays:
+        """Return the arrays of a file at a location; raise UnfitFileError."""
+        # The bytes are counted before they are read: a text takes longer than its arrays.
+        self._count(data, len(data))
+        arrays = self.read_file(location, data)
+        self._count(data, sum(array.nbytes for array in arrays.values()))
+        return arrays
+
+    def _count(self, data: bytes, size: int) -> None:
+        """Raise UnfitFileError if a file of `size` bytes makes the scene too large.
+
+        A file that is counted again counts once, with its larger size.
+        """
+        self.sizes[data] = max(size, self.sizes.get(data, 0))
+        total = sum(self.sizes.values())
+        if total > MAX_SCENE_BYTES:
+            raise UnfitFileError(
+                f"must have at most {MAX_SCENE_BYTES} bytes together with the other files of the "
+                f"scene, and with their arrays, and makes them {total}: make meshes coarser (in "
+                "Blender: Decimate), or leave out frames that lie on the way between others"
+            )
 
 
 def check_file(data: bytes) -> None:

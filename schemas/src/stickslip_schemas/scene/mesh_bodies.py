@@ -6,6 +6,7 @@ and its two neighbours, and 0 at both ends, as in the simulation core.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -47,55 +48,98 @@ class Jump:
     """Of the vertex in the faster half of the step [m/s]."""
 
 
-def surface_at_start(body: Mapping[str, Any]) -> TriangleMesh:
-    """Return the triangles of a body of type mesh where they are at 0 s."""
-    file = body["file"]
-    vertices = _frame_positions(file, slice(None), slice(0, 1))[0]
-    if body["motion"] is not None:
-        pose = Track(body["motion"]).pose_at_start(vertices.mean(axis=0))
-        vertices = vertices @ pose[:, :3].T + pose[:, 3]
-    return TriangleMesh(np.asarray(vertices, float), np.asarray(file["triangles"], np.int64))
+@dataclass(eq=False)
+class FileMotion:
+    """The motion of a file of a body. Each part is computed once, however many rules ask for it."""
+
+    file: Mapping[str, Any]
+    """Its arrays."""
+    strength: float
+    """Factor of the displacements since the first frame."""
+
+    @cached_property
+    def start(self) -> Floats:
+        """Positions of the vertices in the first frame (N, 3) [m]."""
+        return np.asarray(_frame_positions(self.file, slice(None), slice(0, 1))[0], float)
+
+    @cached_property
+    def rigid_displacements(self) -> tuple[Floats, Floats]:
+        """Displacements since the first frame (F, 3) [m], and their times (F,) [s].
+
+        They are empty for a mesh that turns or deforms: where its parts are depends on their shape.
+        """
+        times = np.asarray(self.file["times"], float)
+        # One frame cannot move.
+        if len(times) < 2:
+            return np.zeros((1, 3)), times
+        moves = np.empty((0, 3))
+        for vertices in _groups(self.file):
+            positions = _frame_positions(self.file, vertices, slice(None))
+            shifts = self.strength * (positions - positions[0])
+            moves = moves if len(moves) else shifts[:, 0]
+            if np.abs(shifts - moves[:, None]).max() > RIGID:
+                return np.empty((0, 3)), np.empty(0)
+        return moves, times
+
+    def largest_jump(self, step: float, end: float) -> Jump | None:
+        """Return where a vertex is farthest from an even motion within a step.
+
+        It is None if nothing moves.
+
+        Args:
+            step: Length of the step [s].
+            end: When the scene ends [s].
+        """
+        times = np.asarray(self.file["times"], float)
+        count = int(np.searchsorted(times, end, side="right"))
+        # The frame after the end, and the slope there, have an effect on the way to it.
+        times = times[: count + 2]
+        largest: Jump | None = None
+        if len(times) < 2:
+            return None
+        moves, _ = self.rigid_displacements
+        # Of a mesh that moves as a whole, each vertex makes the same jump.
+        if len(moves):
+            return _jump_of(times, moves[: len(times), None], step, end)
+        for vertices in _groups(self.file):
+            frames = slice(0, len(times))
+            path = self.strength * _frame_positions(self.file, vertices, frames)
+            jump = _jump_of(times, path, step, end)
+            if largest is None or jump.distance > largest.distance:
+                largest = Jump(jump.time, int(vertices[jump.vertex]), jump.distance, jump.speed)
+        return largest
 
 
-def rigid_displacements(body: Mapping[str, Any]) -> tuple[Floats, Floats]:
-    """Return displacements of a mesh since its first frame (F, 3) [m], and their times (F,) [s].
+@dataclass(frozen=True, eq=False, slots=True)
+class MovingMesh:
+    """A body of type mesh."""
 
-    They are empty for a body that turns or deforms: where its parts are depends on their shape.
+    frames: FileMotion
+    surface: TriangleMesh
+    """Its triangles where they are at 0 s."""
+
+
+def moving_meshes(document: Mapping[str, Any]) -> dict[str, MovingMesh]:
+    """Return the bodies of type mesh of a scene by name, sorted.
+
+    `document` is the physics as JSON, with the arrays of files. Bodies of one file share what does
+    not depend on their own motion.
     """
-    file = body["file"]
-    times = np.asarray(file["times"], float)
-    moves = np.empty((0, 3))
-    for vertices in _groups(file):
-        positions = _frame_positions(file, vertices, slice(None))
-        shifts = float(body["strength"]) * (positions - positions[0])
-        moves = moves if len(moves) else shifts[:, 0]
-        if np.abs(shifts - moves[:, None]).max() > RIGID:
-            return np.empty((0, 3)), np.empty(0)
-    return moves, times
-
-
-def largest_jump(body: Mapping[str, Any], step: float, end: float) -> Jump | None:
-    """Return where a vertex is farthest from an even motion within a step; None if nothing moves.
-
-    Args:
-        body: The JSON of a body of type mesh, with the arrays of its file.
-        step: Length of the step [s].
-        end: When the scene ends [s].
-    """
-    file = body["file"]
-    times = np.asarray(file["times"], float)
-    count = int(np.searchsorted(times, end, side="right"))
-    # The frame after the end, and the slope there, have an effect on the way to it.
-    times = times[: count + 2]
-    largest: Jump | None = None
-    if len(times) < 2:
-        return None
-    for vertices in _groups(file):
-        path = float(body["strength"]) * _frame_positions(file, vertices, slice(0, len(times)))
-        jump = _jump_of(times, path, step, end)
-        if largest is None or jump.distance > largest.distance:
-            largest = Jump(jump.time, int(vertices[jump.vertex]), jump.distance, jump.speed)
-    return largest
+    by_file: dict[tuple[int, float], FileMotion] = {}
+    meshes = {}
+    for name, body in sorted(document["bodies"].items()):
+        if body["type"] != "mesh":
+            continue
+        file, strength = body["file"], float(body["strength"])
+        # The document keeps the file, so its identity stays that of its arrays.
+        frames = by_file.setdefault((id(file), strength), FileMotion(file, strength))
+        vertices = frames.start
+        if body["motion"] is not None:
+            pose = Track(body["motion"]).pose_at_start(vertices.mean(axis=0))
+            vertices = vertices @ pose[:, :3].T + pose[:, 3]
+        triangles = np.asarray(file["triangles"], np.int64)
+        meshes[name] = MovingMesh(frames, TriangleMesh(vertices, triangles))
+    return meshes
 
 
 def _jump_of(times: Floats, path: Floats, step: float, end: float) -> Jump:
@@ -116,53 +160,56 @@ def _jump_of(times: Floats, path: Floats, step: float, end: float) -> Jump:
     scores[times[:-1] > end] = 0.0
     looks = min(CLOSEST_LOOKS, scores.size)
     chosen = np.argpartition(scores, scores.size - looks, axis=None)[-looks:]
-    largest = Jump(0.0, 0, 0.0, 0.0)
+    pieces, vertices = np.unravel_index(chosen, scores.shape)
     offsets = 0.5 * step * np.arange(-SAMPLES_AROUND, SAMPLES_AROUND + 1)
-    for piece, vertex in zip(*np.unravel_index(chosen, scores.shape), strict=True):
-        instants = np.concatenate([times[piece] + offsets, times[piece + 1] + offsets])
-        instants = np.clip(np.sort(instants), 0.0, end)
-        middles = np.clip(instants, 0.5 * step, None)
-        curve = _Cubics(times, path[:, vertex], slopes[:, vertex])
-        begin, ends = curve.at(middles - 0.5 * step), curve.at(middles + 0.5 * step)
-        at_middle = curve.at(middles)
-        distances = np.linalg.norm(at_middle - 0.5 * (begin + ends), axis=1)
-        # What goes and comes back within a step has no speed over all of it.
-        ways = np.linalg.norm(np.stack([at_middle - begin, ends - at_middle]), axis=2).max(axis=0)
-        worst = int(np.argmax(distances))
-        if distances[worst] > largest.distance:
-            largest = Jump(
-                float(middles[worst] - 0.5 * step),
-                int(vertex),
-                float(distances[worst]),
-                float(ways[worst]) / (0.5 * step),
-            )
-    return largest
+    # (L, K) instants around the begin and the end of each chosen piece.
+    instants = np.hstack([times[pieces][:, None] + offsets, times[pieces + 1][:, None] + offsets])
+    middles = np.clip(np.clip(instants, 0.0, end), 0.5 * step, None)
+    cubics = _Cubics(times, path, slopes)
+    begins = cubics.at(vertices, middles - 0.5 * step)
+    ends = cubics.at(vertices, middles + 0.5 * step)
+    at_middle = cubics.at(vertices, middles)
+    distances = np.linalg.norm(at_middle - 0.5 * (begins + ends), axis=2)
+    look, sample = np.unravel_index(int(np.argmax(distances)), distances.shape)
+    # What goes and comes back within a step has no speed over all of it.
+    halves = [at_middle - begins, ends - at_middle]
+    way = max(float(np.linalg.norm(half[look, sample])) for half in halves)
+    return Jump(
+        float(middles[look, sample] - 0.5 * step),
+        int(vertices[look]),
+        float(distances[look, sample]),
+        way / (0.5 * step),
+    )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Cubics:
-    """A path through frames, with slopes at them."""
+    """Paths of vertices through frames, with slopes at them."""
 
     times: Floats
     """(F,) [s]"""
     values: Floats
-    """(F, 3) [m]"""
+    """(F, V, 3) [m]"""
     slopes: Floats
-    """(F, 3) [m/s]"""
+    """(F, V, 3) [m/s]"""
 
-    def at(self, instants: Floats) -> Floats:
-        """Return the positions (K, 3) [m] at instants (K,) [s]; nothing moves outside of frames."""
+    def at(self, vertices: Integers, instants: Floats) -> Floats:
+        """Return where vertices (L,) are at K instants each (L, K) [s]: (L, K, 3) [m].
+
+        Nothing moves outside of the frames.
+        """
         inside = np.clip(instants, self.times[0], self.times[-1])
         last_piece = len(self.times) - 2
         piece = np.clip(np.searchsorted(self.times, inside, side="right") - 1, 0, last_piece)
-        length = np.diff(self.times)[piece][:, None]
-        s = (inside - self.times[piece])[:, None] / length
+        length = np.diff(self.times)[piece][..., None]
+        s = (inside - self.times[piece])[..., None] / length
+        of = vertices[:, None]
         # Hermite's cubic between two frames.
         return np.asarray(
-            self.values[piece] * (1.0 + 2.0 * s) * (1.0 - s) ** 2
-            + self.slopes[piece] * length * s * (1.0 - s) ** 2
-            + self.values[piece + 1] * s * s * (3.0 - 2.0 * s)
-            + self.slopes[piece + 1] * length * s * s * (s - 1.0)
+            self.values[piece, of] * (1.0 + 2.0 * s) * (1.0 - s) ** 2
+            + self.slopes[piece, of] * length * s * (1.0 - s) ** 2
+            + self.values[piece + 1, of] * s * s * (3.0 - 2.0 * s)
+            + self.slopes[piece + 1, of] * length * s * s * (s - 1.0)
         )
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from stickslip_schemas.scene.mesh_bodies import largest_jump, surface_at_start
+from stickslip_schemas.scene.mesh_bodies import MovingMesh
 from stickslip_schemas.scene.motions import SHORTEST_STEPS, Track
 from stickslip_schemas.scene.parameters import Location
 from stickslip_schemas.scene.sheets import SheetStart, held_vertices
@@ -35,20 +35,24 @@ COMPARED_VERTICES = 12
 
 
 def motion_faults(
-    document: Mapping[str, Any], sheets: list[SheetStart], end: float
+    document: Mapping[str, Any],
+    sheets: list[SheetStart],
+    meshes: Mapping[str, MovingMesh],
+    end: float,
 ) -> Iterator[StartFault]:
     """Yield holders and bodies that move too fast for the shortest steps of the preset.
 
     Args:
         document: The physics as JSON, with the arrays of files.
         sheets: Where the sheets start.
+        meshes: The bodies of type mesh.
         end: When the scene ends [s].
     """
     shortest, error = SHORTEST_STEPS[document["preset"]]
     limit = (
         f"steps of {shortest:g} s follow to {error:g} m, as the preset {document['preset']} asks"
     )
-    for path, motion, radius in _rigid_motions(document, sheets):
+    for path, motion, radius in _rigid_motions(document, sheets, meshes):
         time, unevenness = Track(motion).unevenness(shortest, radius, end)
         if unevenness > MAX_UNEVENNESS * error:
             rule = (
@@ -56,8 +60,8 @@ def motion_faults(
                 "motion; give it more time, or a ramp (turns are in radians)"
             )
             yield StartFault(path, rule, {"time": time})
-    for name, body in sorted(document["bodies"].items()):
-        jump = largest_jump(body, shortest, end) if body["type"] == "mesh" else None
+    for name, mesh in meshes.items():
+        jump = mesh.frames.largest_jump(shortest, end)
         if jump is not None and jump.distance > MAX_UNEVENNESS * error:
             rule = (
                 f"must have frames that {limit}, and at {jump.time:g} s vertex {jump.vertex} is "
@@ -68,7 +72,7 @@ def motion_faults(
 
 
 def _rigid_motions(
-    document: Mapping[str, Any], sheets: list[SheetStart]
+    document: Mapping[str, Any], sheets: list[SheetStart], meshes: Mapping[str, MovingMesh]
 ) -> Iterator[tuple[Location, Any, float]]:
     """Yield the motions of a document: location, motion, and radius of what turns [m]."""
     for sheet in sheets:
@@ -82,8 +86,7 @@ def _rigid_motions(
         # A plane does not move, and other bodies count where they are near the cloth, of which
         # only a mesh counts as a whole.
         if body.get("motion") is not None:
-            is_mesh = body["type"] == "mesh"
-            radius = _radius(surface_at_start(body).vertices) if is_mesh else 0.0
+            radius = _radius(meshes[name].surface.vertices) if name in meshes else 0.0
             yield ("bodies", name, "motion"), body["motion"], radius
 
 

@@ -21,6 +21,9 @@ Value = Float | CustomName
 LOOKS_AXES = ("texture", "viewpoint", "lighting", "substrate")
 """Axes that every scene has: no parameter may have their names."""
 
+_COEFFICIENTS = ("static", "kinetic")
+"""Of a pair that has both instead of `mu`."""
+
 _FIXED = ("duration", "end", "frame_rate", "spacing")
 """Numbers that decide on the shapes of arrays."""
 
@@ -150,18 +153,15 @@ class Parameter(Document):
 def resolve_path(document: Mapping[str, Any], path: str) -> Location:
     """Return the location that a dotted path leads to.
 
-    `friction.A.B` finds the coefficient of two in any order.
+    `friction.A.B` finds the coefficient of two in any order, `friction.A.B.static` and `.kinetic`
+    those of two that have both.
 
     Raises LookupError, which names the last location that exists.
     """
     words = path.split(".")
-    if words[0] == "friction" and len(words) == 3:
-        for number, pair in enumerate(document["friction"]):
-            if sorted(pair["between"]) == sorted(words[1:]):
-                return ("friction", number, "mu")
-        raise LookupError(
-            f"must name two of `friction`, which has no pair of {words[1]} and {words[2]}"
-        )
+    is_of_pair = len(words) == 3 or (len(words) == 4 and words[3] in _COEFFICIENTS)
+    if words[0] == "friction" and is_of_pair:
+        return _resolve_friction(document["friction"], *words[1:])
     value: Any = document
     location: list[str | int] = []
     for word in words:
@@ -178,6 +178,23 @@ def resolve_path(document: Mapping[str, Any], path: str) -> Location:
         value = value[step]
         location.append(step)
     return tuple(location)
+
+
+def _resolve_friction(
+    pairs: Sequence[Mapping[str, Any]], first: str, second: str, coefficient: str = "mu"
+) -> Location:
+    """Return the location of a coefficient of friction of two things; raise LookupError."""
+    for number, pair in enumerate(pairs):
+        if sorted(pair["between"]) != sorted((first, second)):
+            continue
+        if coefficient in pair:
+            return ("friction", number, coefficient)
+        known = [f"friction.{first}.{second}.{name}" for name in _COEFFICIENTS if name in pair]
+        raise LookupError(
+            "must lead to a coefficient of the pair, which has "
+            + (" and ".join(known) or f"one, friction.{first}.{second}")
+        )
+    raise LookupError(f"must name two of `friction`, which has no pair of {first} and {second}")
 
 
 def _dead_end(location: Sequence[str | int], word: str, names: list[str]) -> str:

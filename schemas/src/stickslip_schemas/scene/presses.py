@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from stickslip_schemas.scene.box_trees import Workload
 from stickslip_schemas.scene.geometry import TriangleMesh, ray_lengths
-from stickslip_schemas.scene.mesh_bodies import rigid_displacements, surface_at_start
+from stickslip_schemas.scene.mesh_bodies import MovingMesh
 from stickslip_schemas.scene.motions import Track
 from stickslip_schemas.scene.shapes import start_gap
 from stickslip_schemas.scene.sheets import SheetStart
@@ -60,7 +60,11 @@ FARTHEST_FALL = 100.0
 
 
 def press_faults(
-    document: Mapping[str, Any], sheets: list[SheetStart], end: float, workload: Workload
+    document: Mapping[str, Any],
+    sheets: list[SheetStart],
+    meshes: Mapping[str, MovingMesh],
+    end: float,
+    workload: Workload,
 ) -> Iterator[StartFault]:
     """Yield the bodies that are pushed into another one through the cloth between them.
 
@@ -70,16 +74,20 @@ def press_faults(
     Args:
         document: The physics as JSON, with the arrays of files.
         sheets: Where the sheets start.
+        meshes: The bodies of type mesh.
         end: When the scene ends [s].
         workload: The comparisons of triangles that are allowed; TooManyPairsError ends it.
     """
-    bodies = [_solid_of(name, body) for name, body in sorted(document["bodies"].items())]
+    bodies = [
+        _solid_of(name, body, meshes.get(name)) for name, body in sorted(document["bodies"].items())
+    ]
+    cloths = [_cloth_of(document, sheet) for sheet in sheets if not sheet.is_hung]
     for body in bodies:
         for other in bodies:
             # Of two bodies that move, the first one by name is the one to be named.
             if not body.is_moved or (other.is_moved and other.name <= body.name):
                 continue
-            fault = _press_fault(document, _Approach(body, other), sheets, end, workload)
+            fault = _press_fault(document, _Approach(body, other), cloths, end, workload)
             if fault is not None:
                 yield fault
                 break
@@ -88,7 +96,7 @@ def press_faults(
 def _press_fault(
     document: Mapping[str, Any],
     approach: "_Approach",
-    sheets: list[SheetStart],
+    cloths: "list[_Cloth]",
     end: float,
     workload: Workload,
 ) -> StartFault | None:
@@ -98,7 +106,8 @@ def _press_fault(
         closing = approach.closing(time)
         if closing is None:
             continue
-        lying = [sheet for sheet in sheets if _stays(document, sheet, closing.direction)]
+        gravity = np.array(document["gravity"], float)
+        lying = [cloth for cloth in cloths if cloth.stays(gravity, closing.direction)]
         excess = closing.distances[-1] - _room(approach, closing, lying, workload)
         if excess <= 0.0:
             continue
@@ -146,13 +155,13 @@ class _Solid:
         return np.where(gaps < FALL_TOLERANCE, travelled, np.inf)
 
 
-def _solid_of(name: str, body: Mapping[str, Any]) -> _Solid:
-    """Return a body of the document, and its motion."""
-    surface = surface_at_start(body) if body["type"] == "mesh" else None
-    frames = (np.zeros((1, 3)), np.zeros(1))
-    if surface is not None:
-        frames = rigid_displacements(body)
-    moves, times = frames
+def _solid_of(name: str, body: Mapping[str, Any], mesh: MovingMesh | None) -> _Solid:
+    """Return a body of the document, and its motion; `mesh` is None of one without triangles."""
+    surface = None
+    moves, times = np.zeros((1, 3)), np.zeros(1)
+    if mesh is not None:
+        surface = mesh.surface
+        moves, times = mesh.frames.rigid_displacements
     is_rigid = len(moves) > 0
     if body.get("motion") is None:
         by_frames = partial(_interpolated, times, moves) if is_rigid else None
@@ -228,36 +237,61 @@ def _aside(moves: Floats, direction: Floats) -> float:
     return float(np.linalg.norm(moves - along[:, None] * direction, axis=1).max())
 
 
-def _stays(document: Mapping[str, Any], sheet: SheetStart, direction: Floats) -> bool:
-    """Return whether it is known where a sheet is when a press comes along a direction.
+@dataclass(frozen=True, eq=False, slots=True)
+class _Cloth:
+    """A sheet that presses are compared with."""
 
-    It lies on what is below it, or a holder that stays holds it.
-    """
+    points: Floats
+    """Vertices of it at the start, evenly spread (N, 3) [m]."""
+    size: float
+    """The longer side of the flat sheet [m]."""
+    is_moved: bool
+    """True if a holder moves it."""
+    is_held: bool
+    """True if a holder always holds it."""
+
+    def stays(self, gravity: Floats, direction: Floats) -> bool:
+        """Return whether it is known where the sheet is when a press comes along a direction.
+
+        It lies on what is below it, or a holder that stays holds it.
+        """
+        if self.is_moved:
+            return False
+        is_down = float(gravity @ direction) >= LEAST_DOWN * float(np.linalg.norm(gravity))
+        return is_down or self.is_held
+
+
+def _cloth_of(document: Mapping[str, Any], sheet: SheetStart) -> _Cloth:
+    """Return what presses need of a sheet."""
+    count = len(sheet.positions)
+    chosen = np.unique(np.linspace(0, count - 1, min(count, MAX_VERTICES)).astype(np.int64))
     holders = document["sheets"][sheet.name]["holders"].values()
-    if sheet.is_hung or any(holder["motion"] is not None for holder in holders):
-        return False
-    gravity = np.array(document["gravity"], float)
-    is_down = float(gravity @ direction) >= LEAST_DOWN * float(np.linalg.norm(gravity))
-    return is_down or any(holder["grasp"] is None for holder in holders)
+    return _Cloth(
+        sheet.positions[chosen],
+        float(np.ptp(sheet.rest, axis=0).max()),
+        is_moved=any(holder["motion"] is not None for holder in holders),
+        is_held=any(holder["grasp"] is None for holder in holders),
+    )
 
 
 def _room(
-    approach: _Approach, closing: _Closing, sheets: list[SheetStart], workload: Workload
+    approach: _Approach, closing: _Closing, cloths: list[_Cloth], workload: Workload
 ) -> float:
     """Return how far two bodies can come together until they hold cloth [m]; inf if never."""
     rooms = [np.inf]
     direction = closing.direction
-    for sheet in sheets:
-        count = len(sheet.positions)
-        chosen = np.unique(np.linspace(0, count - 1, min(count, MAX_VERTICES)).astype(np.int64))
-        points = sheet.positions[chosen]
+    for cloth in cloths:
         # Each vertex is followed to the body ahead, and back to the one that comes.
-        to_other = approach.other.falls(points, direction, workload)
-        to_body = approach.body.falls(points, -direction, workload)
+        to_other = approach.other.falls(cloth.points, direction, workload)
+        is_between = np.isfinite(to_other)
+        if not is_between.any():
+            continue
+        to_body = np.full(len(cloth.points), np.inf)
+        to_body[is_between] = approach.body.falls(cloth.points[is_between], -direction, workload)
         room = to_other + to_body
         # The one that reaches the cloth first pushes it until the other one is there.
         pushed = np.abs(np.interp(room, closing.distances, closing.ways) - to_body)
-        stays = pushed <= MAX_PUSH * float(np.ptp(sheet.rest, axis=0).max())
+        stays = pushed <= MAX_PUSH * cloth.size
         distances = np.sort(np.where(stays & np.isfinite(room), room, np.inf))
         rooms.append(float(distances[int(MIN_FRACTION * len(distances))]))
     return min(rooms)

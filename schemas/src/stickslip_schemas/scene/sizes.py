@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from stickslip_schemas.scene.gate import MAX_PATH_ROWS, MAX_TRIANGLES
-from stickslip_schemas.scene.mesh_bodies import surface_at_start
+from stickslip_schemas.scene.mesh_bodies import MovingMesh
 from stickslip_schemas.scene.parameters import Location
 from stickslip_schemas.scene.parts import LARGEST, unit_hint
 from stickslip_schemas.scene.shapes import start_gap
@@ -72,12 +72,15 @@ def _paths(document: Mapping[str, Any]) -> Iterator[tuple[Location, Mapping[str,
             yield (*location, "path"), motion
 
 
-def gap_faults(document: Mapping[str, Any], sheets: list[SheetStart]) -> Iterator[StartFault]:
+def gap_faults(
+    document: Mapping[str, Any], sheets: list[SheetStart], meshes: Mapping[str, MovingMesh]
+) -> Iterator[StartFault]:
     """Yield sheets that start very far from all that they could touch, as with mixed units.
 
     Args:
         document: The physics as JSON, with the arrays of files, and with the roundings of boxes.
         sheets: Where the sheets start.
+        meshes: The bodies of type mesh.
     """
     holders = {sheet.name: document["sheets"][sheet.name]["holders"].values() for sheet in sheets}
     motions = [holder["motion"] for of_sheet in holders.values() for holder in of_sheet]
@@ -87,7 +90,10 @@ def gap_faults(document: Mapping[str, Any], sheets: list[SheetStart]) -> Iterato
         return
     for sheet in sheets:
         size = float(np.ptp(sheet.rest, axis=0).max())
-        gaps = [_body_gap(body, sheet) for body in document["bodies"].values()]
+        solids = [body for name, body in document["bodies"].items() if name not in meshes]
+        gaps = [float(start_gap(body, sheet.positions).min()) for body in solids]
+        # The box around a mesh tells enough.
+        gaps += [_box_gap(sheet, mesh.surface.vertices) for mesh in meshes.values()]
         gaps += [_box_gap(sheet, other.positions) for other in sheets if other is not sheet]
         gap = min(gaps)
         if gap <= max(MAX_GAP, MAX_GAP_RATIO * size):
@@ -98,13 +104,6 @@ def gap_faults(document: Mapping[str, Any], sheets: list[SheetStart]) -> Iterato
         )
         origin = document["sheets"][sheet.name]["origin"]
         yield StartFault(("sheets", sheet.name, "origin"), rule, origin)
-
-
-def _body_gap(body: Mapping[str, Any], sheet: SheetStart) -> float:
-    """Return the distance of a sheet from a body at the start [m], for a mesh from its box."""
-    if body["type"] == "mesh":
-        return _box_gap(sheet, surface_at_start(body).vertices)
-    return float(start_gap(body, sheet.positions).min())
 
 
 def _box_gap(sheet: SheetStart, points: Floats) -> float:

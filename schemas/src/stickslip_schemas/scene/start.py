@@ -33,7 +33,7 @@ from stickslip_schemas.scene.geometry import (
     find_touch,
 )
 from stickslip_schemas.scene.hanging import hung_positions, uncertainty
-from stickslip_schemas.scene.mesh_bodies import surface_at_start
+from stickslip_schemas.scene.mesh_bodies import MovingMesh, moving_meshes
 from stickslip_schemas.scene.motion_faults import motion_faults, stretch_faults
 from stickslip_schemas.scene.parameters import Location
 from stickslip_schemas.scene.presses import press_faults
@@ -86,32 +86,36 @@ def find_start_faults(document: Mapping[str, Any]) -> list[StartFault]:
     faults += _sheet_faults(document, sheets)
     faults += _holder_faults(document, sheets)
     end = document_end(document)
-    faults += motion_faults(document, sheets, end)
+    meshes = moving_meshes(document)
+    faults += motion_faults(document, sheets, meshes, end)
     # Geometry of a wrong unit or shape would only repeat these faults in many other words.
     if not faults:
         faults += _radius_faults(document, sheets)
     cell = max(sheet.cell for sheet in sheets)
     document = {**document, "bodies": with_roundings(document["bodies"], cell)}
     if not faults:
-        faults += gap_faults(document, sheets)
+        faults += gap_faults(document, sheets, meshes)
     if not faults:
         faults += _body_faults(document, sheets)
     if not faults:
         faults += stretch_faults(document, sheets, end)
     if not faults:
-        faults += _crowded_faults(document, sheets, end)
+        faults += _crowded_faults(document, sheets, meshes, end)
     return faults
 
 
 def _crowded_faults(
-    document: Mapping[str, Any], sheets: list[SheetStart], end: float
+    document: Mapping[str, Any],
+    sheets: list[SheetStart],
+    meshes: Mapping[str, MovingMesh],
+    end: float,
 ) -> list[StartFault]:
     """Return the faults of starts and presses, or that too many triangles are near each other."""
     workload = Workload(MAX_COMPARED_PAIRS)
     try:
-        faults = list(_contact_faults(document, sheets, workload))
+        faults = list(_contact_faults(document, sheets, meshes, workload))
         if not faults:
-            faults += press_faults(document, sheets, end, workload)
+            faults += press_faults(document, sheets, meshes, end, workload)
     except TooManyPairsError:
         rule = (
             f"must be so far from each other and from bodies that at most {MAX_COMPARED_PAIRS} "
@@ -289,15 +293,14 @@ def _held_at_start(document: Mapping[str, Any], sheet: SheetStart) -> npt.NDArra
 
 
 def _contact_faults(
-    document: Mapping[str, Any], sheets: list[SheetStart], workload: Workload
+    document: Mapping[str, Any],
+    sheets: list[SheetStart],
+    meshes: Mapping[str, MovingMesh],
+    workload: Workload,
 ) -> Iterator[StartFault]:
     """Yield sheets that cross themselves, other sheets or triangles of bodies, or lie in them."""
     standing = [sheet for sheet in sheets if not sheet.is_hung]
-    surfaces = [
-        (name, surface_at_start(body))
-        for name, body in sorted(document["bodies"].items())
-        if body["type"] == "mesh"
-    ]
+    surfaces = [(name, mesh.surface) for name, mesh in meshes.items()]
     for number, sheet in enumerate(standing):
         self_contact = document["sheets"][sheet.name]["self_contact"]
         # A flat sheet cannot cross itself.

@@ -76,6 +76,22 @@ class _Loader(yaml.SafeLoader):
             self._expanded_sizes[id(node)] = self._value_count - count_before
         return node
 
+    def get_single_node(self) -> yaml.Node | None:
+        """Return the document of a file; a second one is refused in plain words."""
+        try:
+            return super().get_single_node()
+        except ComposerError as error:
+            if error.context != "expected a single document in the stream":
+                raise
+            problem = "a file must have one document, and --- begins another one"
+            raise ComposerError(None, None, problem, error.problem_mark) from error
+
+    def refuse_tag(self, node: yaml.Node) -> Any:
+        """Refuse a tag, which would ask for an object of a programming language."""
+        tag = node.tag.replace(_TAG, "!!")
+        problem = f"the tag {tag} must not be there: a value has no tag, or that of its type"
+        raise ConstructorError(None, None, problem, node.start_mark)
+
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         """Construct a mapping whose keys are words, each there once."""
         keys: set[str] = set()
@@ -135,6 +151,7 @@ _add("bool", _BOOL, "tTfF")
 _add("int", _INT, "-+0123456789")
 _add("float", _FLOAT, "-+.0123456789")
 _add("merge", re.compile("<<"), "<")
+_Loader.add_constructor(None, _Loader.refuse_tag)
 _Loader.add_constructor(f"{_TAG}int", _Loader.construct_number)
 _Loader.add_constructor(f"{_TAG}float", _Loader.construct_decimal)
 

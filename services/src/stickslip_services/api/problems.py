@@ -60,6 +60,10 @@ _FORMS = {
 """Rules of parameters in words, by their regular expression."""
 
 
+SHOWN_DETAIL = 4000
+"""Longest detail of an answer [characters]: it may repeat a name of the request."""
+
+
 @dataclass(eq=False)
 class ProblemError(Exception):
     """A problem: raised by a route, or sent as it is by middleware."""
@@ -81,7 +85,7 @@ class ProblemError(Exception):
             type=f"urn:stickslip:problem:{self.code}",
             title=self.title,
             status=self.status,
-            detail=self.detail,
+            detail=self.detail[:SHOWN_DETAIL],
             code=self.code,
             instance=path,
             request_id=request_id,

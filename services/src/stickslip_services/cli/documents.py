@@ -14,14 +14,13 @@ from pydantic import ValidationError
 from stickslip_schemas.documents.problems import field_errors
 from stickslip_schemas.kinds import AnyJobSpec, job_spec_adapter
 from stickslip_schemas.scene.document import MAX_DOCUMENT_BYTES, Scene
-from stickslip_schemas.scene.library import load_scene
+from stickslip_schemas.scene.library import load_scene, scene_names
 from stickslip_schemas.spec.fabrics import FabricNumbers
 from stickslip_schemas.spec.jobs import JobSpec
-from stickslip_schemas.spec.names import MATERIAL_NAME, Material
+from stickslip_schemas.spec.names import MATERIAL_NAME, Material, did_you_mean
 from stickslip_schemas.spec.yaml_documents import parse_yaml
 
 from stickslip_services.cli.common import field_line
-from stickslip_services.client.errors import ClientError
 from stickslip_services.errors import CommandError
 
 FABRICS = "fabrics"
@@ -40,6 +39,8 @@ _MAGIC = {
     b"\xff\xd8\xff": "a JPEG picture",
     b"PK\x03\x04": "a ZIP or NPZ file",
     b"%PDF": "a PDF file",
+    b"\xff\xfe": "text in UTF-16",
+    b"\xfe\xff": "text in UTF-16",
 }
 """First bytes of files that people name by mistake."""
 
@@ -87,15 +88,16 @@ def _read_text(path: Path) -> str:
         raise CommandError(
             f"{path} must have at most {MAX_FILE_BYTES} bytes, and it has {len(data)}"
         )
+    rule = f"{path} cannot be read: it must be YAML or JSON, text in UTF-8"
+    # A PDF file may be nothing but text.
+    for magic, kind in _MAGIC.items():
+        if data.startswith(magic):
+            raise CommandError(f"{rule}, and it is {kind}")
     try:
         # Editors of Windows write a mark of the byte order, which is no part of the text.
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        kinds = [kind for magic, kind in _MAGIC.items() if data.startswith(magic)]
-        other = f", and it is {kinds[0]}" if kinds else f"; byte {error.start} is not UTF-8"
-        raise CommandError(
-            f"{path} cannot be read: it must be YAML or JSON, text in UTF-8{other}"
-        ) from error
+        raise CommandError(f"{rule}; byte {error.start} is not UTF-8") from error
 
 
 def _yaml_problem(error: yaml.MarkedYAMLError) -> str:
@@ -270,17 +272,19 @@ def find_scene(name: str) -> tuple[Scene, dict[str, bytes]]:
     """Return a scene with its files by digest; `name` is a file or a built-in scene.
 
     Raises:
-        CommandError: The file does not exist, or breaks a rule.
-        ClientError: There is no built-in scene of this name.
+        CommandError: The file does not exist, or breaks a rule, or no built-in scene has the name.
     """
     # What looks like a file is one: a missing file must not be answered with a list of scenes.
     path = Path(name)
     if path.exists() or path.suffix in SCENE_SUFFIXES or "/" in name:
         return read_scene(path)
-    try:
-        return load_scene(name), {}
-    except ValueError as error:
-        raise ClientError(f"scene {error}, in a file; it is {name!r}") from None
+    names = scene_names()
+    if name not in names:
+        raise CommandError(
+            f"scene must be one of {', '.join(names)}, or a file, and it is "
+            f"{name!r}{did_you_mean(name, names)}"
+        )
+    return load_scene(name), {}
 
 
 def read_scene(path: Path) -> tuple[Scene, dict[str, bytes]]:

@@ -354,6 +354,9 @@ def _upload_file(client: Client, file: Path) -> responses.TextureEntry | respons
         if file.suffix.lower() in SCENE_FILE_SUFFIXES:
             return client.upload_file(data)
         return client.upload_texture(data)
+    # Nobody has looked at the file.
+    except UnreachableError:
+        raise
     except ClientError as error:
         raise ClientError(f"{file} was refused: {error}") from error
 

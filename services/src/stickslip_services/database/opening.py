@@ -76,6 +76,8 @@ def check(settings: Settings, role: Role, *, with_store: bool = False) -> bool:
     Raises DatabaseRefusedError if the role cannot use the database. With `with_store`, it also
     refuses a missing database if the store holds datasets, because the database was lost.
     """
+    if settings.data.exists() and not settings.data.is_dir():
+        raise DatabaseRefusedError(f"--data must be a directory, and {settings.data} is a file")
     if settings.database_url is None:
         revision = _sqlite_revision(settings.database_path)
     else:

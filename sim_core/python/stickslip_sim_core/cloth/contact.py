@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -34,7 +35,18 @@ COMPRESSION: float = compression
 ORIGIN = (0.0, 0.0, 0.0)
 UPRIGHT = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
-BodyTuple = tuple[int, list[float], Floats, float, Floats, Floats]
+
+class Friction(NamedTuple):
+    """Coefficients of friction of two things."""
+
+    kinetic: float
+    """Of what slides."""
+
+    static: float
+    """Of what rests."""
+
+
+BodyTuple = tuple[int, list[float], Floats, float, Floats, Floats, list[float]]
 
 
 @dataclass(frozen=True)
@@ -49,7 +61,10 @@ class Body:
     """
 
     mu: ArrayLike
-    """Coefficient of friction with the cloth, 0 ... 10, or with each of its sheets: (S,)."""
+    """Coefficient of friction with the cloth, 0 ... 10, or with each of its sheets: (S,).
+
+    With `mu_static` it is the kinetic one, of what slides.
+    """
 
     shape: int = 0
     """0 for a plane, which fills z < 0 in its own axes, or 1 for a rounded body.
@@ -72,8 +87,15 @@ class Body:
     rotation: ArrayLike = UPRIGHT
     """Axes of the body in the world, as columns: (3, 3)."""
 
+    mu_static: ArrayLike | None = None
+    """Coefficient of friction of what does not slide yet, as `mu`, and at least that.
+
+    None is `mu`. `contact/friction_cones.hpp` has the rules.
+    """
+
     def __post_init__(self) -> None:
         check_friction(self.mu)
+        check_static_friction(self.mu, self.mu_static)
         origin, turn = np.asarray(self.origin, float), np.asarray(self.rotation, float)
         # A pose comes from a user's motion, so NaN and mirrored axes must stop here.
         if origin.shape != (3,) or not np.isfinite(origin).all():
@@ -101,6 +123,7 @@ class Body:
             self.radius,
             np.asarray(self.origin, float),
             np.asarray(self.rotation, float),
+            [] if self.mu_static is None else np.atleast_1d(self.mu_static).astype(float).tolist(),
         )
 
 
@@ -114,6 +137,27 @@ def check_friction(mu: ArrayLike) -> None:
     if values.ndim > 1 or not values.size or not ((values >= 0.0) & (values <= MU_MAX)).all():
         raise ValueError(
             f"mu: must be in [0, {MU_MAX:g}], one or one a sheet, got {values.tolist()}"
+        )
+
+
+def check_static_friction(mu: ArrayLike, mu_static: ArrayLike | None) -> None:
+    """Check the coefficients of friction of what does not slide yet, if there are any.
+
+    Raises:
+        ValueError: One is below that of what slides, or out of range, or the shapes differ.
+    """
+    if mu_static is None:
+        return
+    sliding, resting = np.asarray(mu, float), np.asarray(mu_static, float)
+    if sliding.shape != resting.shape:
+        raise ValueError(
+            f"mu_static: must have the shape of mu, {sliding.shape}, got {resting.shape}"
+        )
+    # Otherwise cloth would hold less at rest than it does while it slides.
+    if not ((resting >= sliding) & (resting <= MU_MAX)).all():
+        raise ValueError(
+            f"mu_static: must be in [mu, {MU_MAX:g}], and mu is {sliding.tolist()}, "
+            f"got {resting.tolist()}"
         )
 
 
@@ -269,6 +313,12 @@ class SelfContact:
     cloth. Within a sheet all contacts keep the full thickness.
     """
 
+    mu_static: float | ArrayLike | None = None
+    """Coefficient of friction of what does not slide yet, as `mu`, and at least that.
+
+    None is `mu`.
+    """
+
     def __post_init__(self) -> None:
         if self.bearing not in BEARING:
             raise ValueError(f"bearing: must be one of {', '.join(BEARING)}, got {self.bearing!r}")
@@ -278,14 +328,20 @@ class SelfContact:
         # A pair of sheets has no order, so it cannot have two coefficients.
         if mu.ndim and not (mu.ndim == 2 and mu.shape[0] == mu.shape[1] and (mu == mu.T).all()):
             raise ValueError(f"mu: must be a number or a symmetric matrix, got {mu.tolist()}")
+        check_static_friction(self.mu, self.mu_static)
+        resting = np.asarray(self.mu if self.mu_static is None else self.mu_static, float)
+        if not (resting == resting.T).all():
+            raise ValueError(
+                f"mu_static: must be a number or a symmetric matrix, got {resting.tolist()}"
+            )
         thickness = np.asarray(self.thickness, float)
         if thickness.ndim > 1 or not (np.isfinite(thickness) & (thickness > 0.0)).all():
             raise ValueError(
                 f"thickness: must be finite and > 0, one or one a sheet, got {thickness.tolist()}"
             )
 
-    def of_sheets(self, sheets: int) -> tuple[Floats, Floats]:
-        """Return friction (S, S) and thicknesses (S,) [m] of S sheets.
+    def of_sheets(self, sheets: int) -> tuple[Floats, Floats, Floats]:
+        """Return kinetic and static friction (S, S) and thicknesses (S,) [m] of S sheets.
 
         Raises:
             ValueError: `mu` or `thickness` has another number of sheets.
@@ -296,9 +352,12 @@ class SelfContact:
             raise ValueError(f"mu: must be of {sheets} sheets, got {mu.tolist()}")
         if thickness.ndim and thickness.shape != (sheets,):
             raise ValueError(f"thickness: must be of {sheets} sheets, got {thickness.tolist()}")
-        return np.broadcast_to(mu, (sheets, sheets)).copy(), np.broadcast_to(
-            thickness, sheets
-        ).copy()
+        resting = mu if self.mu_static is None else np.asarray(self.mu_static, float)
+        return (
+            np.broadcast_to(mu, (sheets, sheets)).copy(),
+            np.broadcast_to(resting, (sheets, sheets)).copy(),
+            np.broadcast_to(thickness, sheets).copy(),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -340,8 +399,15 @@ class Surface:
     The angle is 0 ... pi, and the normals are taken at time 0. Borders are sharp.
     """
 
+    mu_static: float | ArrayLike | None = None
+    """Coefficient of friction of what does not slide yet, as `mu`, and at least that.
+
+    None is `mu`.
+    """
+
     def __post_init__(self) -> None:
         check_friction(self.mu)
+        check_static_friction(self.mu, self.mu_static)
         if not (np.isfinite(self.thickness) and self.thickness >= 0.0):
             raise ValueError(f"thickness: must be finite and >= 0, got {self.thickness}")
         if not 0.0 <= self.crease <= np.pi:

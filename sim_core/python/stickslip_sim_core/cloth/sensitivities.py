@@ -15,20 +15,24 @@ import numpy as np
 
 from stickslip_sim_core.arrays import Floats
 
-Kind: TypeAlias = Literal[
-    "friction_of_body", "friction_of_pair", "bending", "stretching", "density", "drive"
+FabricProperty: TypeAlias = Literal["bending", "stretching", "density"]
+FrictionKind: TypeAlias = Literal[
+    "friction_of_body", "friction_of_pair", "static_friction_of_body", "static_friction_of_pair"
 ]
+Kind: TypeAlias = FrictionKind | FabricProperty
 
-# The numbers of SensitivityParameter::Kind.
+# The numbers of SensitivityTerm::Kind.
 _NUMBERS: dict[Kind, int] = {
     "friction_of_body": 0,
     "friction_of_pair": 1,
     "bending": 2,
     "stretching": 3,
     "density": 4,
-    "drive": 5,
+    "static_friction_of_body": 5,
+    "static_friction_of_pair": 6,
 }
 
+TermTuple: TypeAlias = tuple[int, int, int, float]
 RatesTuple: TypeAlias = tuple[Floats, Floats, list[tuple[Floats, Floats]]]
 """Derivatives of held vertices, of gravity, and of the origin and turn of each body."""
 
@@ -74,44 +78,77 @@ class DriveRates:
 
 
 @dataclass(frozen=True)
-class Parameter:
-    """A parameter of a run.
-
-    Use the constructors below: `friction`, `pair_friction`, `fabric_factor` and `drive`.
-    """
+class Term:
+    """A number of the cloth that a parameter changes."""
 
     kind: Kind
     first: int = -1
     second: int = -1
+    rate: float = 1.0
+    """Change of the number per unit of the parameter."""
+
+    def as_tuple(self) -> TermTuple:
+        return _NUMBERS[self.kind], self.first, self.second, self.rate
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter of a run: numbers of the cloth that it changes, and what it moves.
+
+    The constructors below make a parameter of one thing: `friction`, `pair_friction`,
+    `fabric_factor` and `drive`.
+    """
+
+    terms: tuple[Term, ...] = ()
     rates: Callable[[float], DriveRates] | None = None
 
-    def as_tuple(self) -> tuple[int, int, int]:
-        return _NUMBERS[self.kind], self.first, self.second
+    def as_tuples(self) -> list[TermTuple]:
+        return [term.as_tuple() for term in self.terms]
 
     def rates_at(self, time: float) -> DriveRates:
         """Return how what drives the cloth depends on the parameter at a time [s]."""
         return self.rates(time) if self.rates else DriveRates()
 
+    def check_bodies(self, bodies: int) -> None:
+        """Check that a run with this number of bodies has those of the parameter.
 
-def friction(body: int, sheet: int | None = None) -> Parameter:
-    """Return the coefficient of friction of a body, with one sheet or with all."""
-    return Parameter("friction_of_body", body, -1 if sheet is None else sheet)
+        Raises:
+            ValueError: A body does not exist.
+        """
+        for term in self.terms:
+            of_body = term.kind in ("friction_of_body", "static_friction_of_body")
+            if of_body and not 0 <= term.first < bodies:
+                raise ValueError(
+                    f"parameter: friction must be of one of {bodies} bodies, got {term.first}"
+                )
 
 
-def pair_friction(first: int, second: int) -> Parameter:
+def friction(body: int, sheet: int | None = None, *, static: bool = False) -> Parameter:
+    """Return the coefficient of friction of a body, with one sheet or with all.
+
+    It is the kinetic coefficient. With `static` it is the static one of a body that has both: only
+    what holds depends on it, so positions do not change by it to first order, and
+    `Cloth.nearest_events` says which change sets something off.
+    """
+    kind: Kind = "static_friction_of_body" if static else "friction_of_body"
+    return Parameter((Term(kind, body, -1 if sheet is None else sheet),))
+
+
+def pair_friction(first: int, second: int, *, static: bool = False) -> Parameter:
     """Return the coefficient of friction of two sheets, of a sheet with itself or with a surface.
 
-    Surfaces are counted after the sheets.
+    Surfaces are counted after the sheets. For `static`, see `friction`.
     """
-    return Parameter("friction_of_pair", min(first, second), max(first, second))
+    kind: Kind = "static_friction_of_pair" if static else "friction_of_pair"
+    return Parameter((Term(kind, min(first, second), max(first, second)),))
 
 
-def fabric_factor(kind: Literal["bending", "stretching", "density"]) -> Parameter:
-    """Return the logarithm of a factor of a property of all fabrics.
+def fabric_factor(kind: FabricProperty, sheet: int | None = None) -> Parameter:
+    """Return the logarithm of a factor of a property of the fabric of one sheet, or of all.
 
     The derivative by the property D itself is the derivative by the logarithm over D.
     """
-    return Parameter(kind)
+    return Parameter((Term(kind, -1 if sheet is None else sheet),))
 
 
 def drive(rates: Callable[[float], DriveRates]) -> Parameter:
@@ -120,4 +157,4 @@ def drive(rates: Callable[[float], DriveRates]) -> Parameter:
     Args:
         rates: Function of the time [s] that returns the derivatives of what drives the cloth.
     """
-    return Parameter("drive", rates=rates)
+    return Parameter(rates=rates)

@@ -119,7 +119,7 @@ class Cloth:
         # The C++ solver has one list of vertices for all surfaces, one surface after the other.
         self._surface_sizes = sizes = [len(surface.at(self.time)) for surface in self.surfaces]
         corners = [np.asarray(surface.triangles) for surface in self.surfaces]
-        mu, thickness = self._touch(sheets)
+        mu, mu_static, thickness = self._touch(sheets)
         edge_fraction, second_fraction = BEARING[self_contact.bearing if self_contact else "all"]
         # The lightest fabric gives the smallest unit, so no sheet converges too early.
         patch_weight = (
@@ -156,6 +156,7 @@ class Cloth:
             surface_of_vertex=np.repeat(np.arange(len(sizes)), sizes).tolist(),
             surface_positions=self._surfaces_at(self.time),
             crease=[surface.crease for surface in self.surfaces],
+            mu_static=mu_static,
         )
         self._solver = self._make(held=self.held.tolist())
         # Time, positions and velocities before the last step. The time inf stands for no step yet.
@@ -175,13 +176,18 @@ class Cloth:
         self._spent = 0.0
         self.gravity = np.tile([0.0, 0.0, -GRAVITY], (len(mesh.rest), 1))
 
-    def _touch(self, sheets: int) -> tuple[Floats, Floats]:
-        """Return friction between sheets and surfaces (-1: no contact), and thicknesses."""
+    def _touch(self, sheets: int) -> tuple[Floats, Floats, Floats]:
+        """Return kinetic and static friction of sheets and surfaces, and thicknesses.
+
+        Friction of -1 stands for no contact.
+        """
         # Surfaces come after the sheets. Two surfaces have no contact: both are prescribed.
         mu = np.full((sheets + len(self.surfaces),) * 2, -1.0)
+        mu_static = mu.copy()
         thickness = np.full(sheets, THICKNESS)
         if self.self_contact:
-            mu[:sheets, :sheets], thickness = self.self_contact.of_sheets(sheets)
+            of_sheets = self.self_contact.of_sheets(sheets)
+            mu[:sheets, :sheets], mu_static[:sheets, :sheets], thickness = of_sheets
         for column, surface in enumerate(self.surfaces, start=sheets):
             own = np.asarray(surface.mu, float)
             # A surface does not have the number of sheets, so it could not check its friction.
@@ -190,7 +196,10 @@ class Cloth:
                     f"mu: of a surface must be one or of {sheets} sheets, got {own.tolist()}"
                 )
             mu[:sheets, column] = mu[column, :sheets] = own
-        return mu, np.append(thickness, [surface.thickness for surface in self.surfaces])
+            resting = own if surface.mu_static is None else np.asarray(surface.mu_static, float)
+            mu_static[:sheets, column] = mu_static[column, :sheets] = resting
+        skins = [surface.thickness for surface in self.surfaces]
+        return mu, mu_static, np.append(thickness, skins)
 
     def _surfaces_at(self, time: float) -> Floats:
         found = [surface.at(time) for surface in self.surfaces]
@@ -500,7 +509,7 @@ class Cloth:
             ValueError: A parameter is friction of what does not touch the cloth.
         """
         self._parameters = tuple(parameters)
-        self._solver.follow([parameter.as_tuple() for parameter in self._parameters])
+        self._solver.follow([parameter.as_tuples() for parameter in self._parameters])
         self._before_sensitivities = (self._no_sensitivities(), self._no_sensitivities())
 
     def set_sensitivities(self, positions: ArrayLike, velocities: ArrayLike | None = None) -> None:
@@ -558,6 +567,8 @@ class Cloth:
         return self._between(time, self._before_sensitivities, now, straight=straight)
 
     def _rates_at(self, time: float, bodies: int) -> list[RatesTuple]:
+        for parameter in self._parameters:
+            parameter.check_bodies(bodies)
         rates = [parameter.rates_at(time) for parameter in self._parameters]
         # The solver reads a row for each thing, and a missing one would be memory of others.
         for by_parameter in rates:
@@ -568,24 +579,25 @@ class Cloth:
     def momentum_rate(self) -> Floats:
         """Rate of the cloth's momentum in the last step (3,) [N]: the sum of all forces.
 
-        The change of `masses @ velocities` over a step is not this rate times its length: the step
-        changes the velocity at the middle of the step before to that at its own middle. It is zero
-        before the first step.
+        It is the rate by which the scheme of each vertex balances forces. The change of
+        `masses @ velocities` over a step is not this rate times its length: velocities belong to
+        the middles of steps, or change over two steps. It is zero before the first step.
         """
         return np.asarray(self._solver.momentum_rate())
 
     def contact_force(self) -> Floats:
         """Return the force of bodies and surfaces on the cloth in the last step (3,) [N].
 
-        It is the rate of momentum, minus the weight and the force of the holders. It is zero before
-        the first step.
+        It is the rate of momentum, minus the weight, the force of the holders and that of damping.
+        It is zero before the first step.
         """
         # The force comes from the balance of momentum, so it does not rely on the friction law.
         if not self.total.steps:
             return np.zeros(3)
         holders = self.reactions[self.held].sum(axis=0)
         weight = (self.masses[:, None] * self.gravity).sum(axis=0)
-        return np.asarray(self.momentum_rate - weight - holders)
+        damping = self._solver.damping_force()
+        return np.asarray(self.momentum_rate - weight - holders - damping)
 
     def softest(self) -> float:
         """Return the smallest eigenvalue of stiffness over mass in this state [1/s^2].

@@ -27,6 +27,7 @@ from stickslip_sim_core.protocols.rods import (
     RodLateralBuckling,
     RodProtocol,
 )
+from stickslip_sim_core.protocols.static_friction import KineticSlide, StaticOnset
 from stickslip_sim_core.protocols.stick_slip import StickSlip
 
 PROTOCOLS: Mapping[str, type[Protocol]] = MappingProxyType(
@@ -48,6 +49,8 @@ PROTOCOLS: Mapping[str, type[Protocol]] = MappingProxyType(
             Gripper,
             Fall,
             SlideToRest,
+            StaticOnset,
+            KineticSlide,
             Impact,
             Swing,
             ShakenFloor,
@@ -92,6 +95,8 @@ QUICK: Mapping[str, Mapping[str, Any]] = {
     "stacked-incline": {"friction": (0.3,), "sheets": (2,), "unstructured": 0},
     "fall": {"durations": (0.3,)},
     "slide-to-rest": {"friction": (0.3,)},
+    "static-onset": {"friction": (0.5,)},
+    "kinetic-slide": {"friction": (0.35,)},
     "impact": {"heights": (0.005,)},
     "gripper": {"friction": (0.3,)},
     "edge": {"radii": (2.0,), "friction": (0.3,), "edges": (0,)},
@@ -124,6 +129,8 @@ class Certification:
 _CLOTH = (
     "fall",
     "slide-to-rest",
+    "static-onset",
+    "kinetic-slide",
     "impact",
     "gripper",
     "inclined-plane",
@@ -133,6 +140,7 @@ _CLOTH = (
 )
 SCENE_PROTOCOLS = (
     *_CLOTH,
+    "swing",
     "shaken-floor",
     "capstan",
     "edge",
@@ -147,9 +155,6 @@ def _of_cloth(preset: SolverSettings) -> Certification:
     # The thesis's steps of 0.5 ms would take hours on the protocols of contact.
     touches = not preset.name.startswith("thesis-")
     names = SCENE_PROTOCOLS if touches else _CLOTH
-    # First order damps a swing by its nature, and no step of scenes is short enough to hide it.
-    if preset.second_order:
-        names = (*names, "swing")
     return Certification(names, "stickslip_sim_core.cloth", preset.numbers)
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
-from stickslip_sim_core.cloth.contact import SelfContact, plane
+from stickslip_sim_core.cloth.contact import Body, SelfContact, plane
 from stickslip_sim_core.cloth.fabrics import fabric
 from stickslip_sim_core.cloth.presets import SolverSettings
 from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
@@ -39,7 +39,7 @@ class OnSlope:
         cloth: Cloth without a state.
         start: Positions of its vertices: (V, 3) [m].
         mu: Friction of the interface.
-        floor: Friction of the plane.
+        floor: The plane, or its friction.
         upper: Whether each vertex is above the interface: (V,).
     """
 
@@ -54,13 +54,13 @@ class OnSlope:
     """Cloth slides if all of its vertices have moved this far [m]."""
 
     def __init__(
-        self, cloth: Cloth, start: Floats, mu: float, floor: float, upper: NDArray[np.bool_]
+        self, cloth: Cloth, start: Floats, mu: float, floor: float | Body, upper: NDArray[np.bool_]
     ) -> None:
         self.cloth = cloth
         self.start = start
         self.mu = mu
         self.upper = upper
-        self.floor = [plane(floor)]
+        self.floor = [floor if isinstance(floor, Body) else plane(floor)]
         cloth.set_state(start)
 
     def moved(self) -> Floats:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
@@ -23,6 +24,8 @@ FABRIC = "gray-interlock"
 DURATIONS = (0.1, 0.3, 0.5)  # s
 FRICTION = (0.1, 0.3, 1.0)
 SPEED = 0.6  # at the start of a slide [m/s]
+DOWN = (0.0, 0.0, -GRAVITY)
+"""Gravity [m/s^2]."""
 HEIGHTS = (0.005, 0.05)
 BALL = 0.03  # radius [m]
 # Of the cloth with the ball and the floor.
@@ -39,9 +42,16 @@ class MotionProtocol(ClothProtocol):
     cells: int = 5
     """Number of cells along a side of the patch."""
 
-    def moved(self, until: float, velocity: Floats, bodies: Sequence[Body], along: Floats) -> float:
+    def moved(
+        self,
+        until: float,
+        velocity: Floats,
+        bodies: Sequence[Body],
+        along: Floats,
+        gravity: ArrayLike = DOWN,
+    ) -> float:
         """Return how far a flat patch moves along a direction until a time [s]: mean, in m."""
-        return self.carried(until, velocity, lambda _time: bodies, along)
+        return self.carried(until, velocity, lambda _time: bodies, along, gravity)
 
     def carried(
         self,
@@ -49,15 +59,16 @@ class MotionProtocol(ClothProtocol):
         velocity: Floats,
         bodies: Callable[[float], Sequence[Body]],
         along: Floats,
+        gravity: ArrayLike = DOWN,
     ) -> float:
         """Return the same for bodies that move: a function of the time [s]."""
         mesh = meshes.grid(SIDE, SIDE, self.cells, self.cells)
         cloth = Cloth(mesh, fabric(FABRIC), self.solver)
         start = np.column_stack([mesh.rest, np.zeros(len(mesh.rest))])
         cloth.set_state(start, np.tile(velocity, (len(start), 1)), bodies(0.0))
-        gravity = cloth.gravity.copy()
+        at_vertices = np.tile(np.asarray(gravity, float), (len(start), 1))
         nothing_held = np.empty((0, 3))
-        cloth.advance(until, lambda time: (gravity, nothing_held, bodies(time)))
+        cloth.advance(until, lambda time: (at_vertices, nothing_held, bodies(time)))
         self.tally.count(cloth)
         return float((cloth.positions_at(until) - start).mean(axis=0) @ along)
 

@@ -3,8 +3,8 @@
 The cloth is a square that is held at two corners.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,11 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from stickslip_sim_core.arrays import Floats, check_range
 from stickslip_sim_core.cloth import meshes
-from stickslip_sim_core.cloth.contact import SELF_FRICTION, Body, SelfContact, plane
+from stickslip_sim_core.cloth.contact import MU_MAX, SELF_FRICTION, Body, SelfContact, plane
 from stickslip_sim_core.cloth.fabrics import Fabric, fabric
 from stickslip_sim_core.cloth.presets import SolverSettings, preset_named
 from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
-from stickslip_sim_core.scenes.holders import Holder, Hung, hung
+from stickslip_sim_core.scenes.family import SceneFamily, SceneParameter
+from stickslip_sim_core.scenes.holders import Hang, Hanging, Holder, Hung, hung
 from stickslip_sim_core.scenes.kind import Record
 from stickslip_sim_core.scenes.scene import ClothRun, Scene, cloth_kind, fabric_labels
 
@@ -44,8 +45,18 @@ SPEED = 0.01
 ACCELERATION = 0.01
 """Acceleration of the holders at the start and end of a travel [m/s^2]."""
 
+FACTORS = (0.1, 10.0)
+"""Range of factors of the fabric and of the speed of the holders."""
+
 FRAME_RATE = 2.4
 """Frames in a second [1/s]."""
+
+SECOND_ORDER = False
+"""Setting `second_order` of a drag, whatever the preset has.
+
+With it, an undamped cloth flutters after each turn of the holders, and a drag takes 2.7 times the
+CPU time.
+"""
 
 
 def travel(time: Floats, distance: Floats) -> Floats:
@@ -82,6 +93,9 @@ def holder_path(time: ArrayLike) -> Floats:
     return np.stack([(ways[..., 1:] * (-1.0) ** legs).sum(axis=-1), -ways[..., 0]], axis=-1)
 
 
+STATIC_RATIO_MAX = 3.0
+"""Largest static over kinetic coefficient of friction."""
+
 FRAMES = 300
 """Frames of a whole drop-and-drag."""
 
@@ -93,15 +107,88 @@ def held_by_holders(mesh: meshes.Mesh) -> NDArray[np.intp]:
     return np.flatnonzero((np.abs(mesh.rest[:, 0]) > inner) & (mesh.rest[:, 1] > inner))
 
 
-def hang(mesh: meshes.Mesh, fabric: Fabric, *, seed: int, kernel: str | None = None) -> Hung:
-    """Return the shape in which the cloth hangs at rest under its holders, over the floor."""
+def hang(
+    mesh: meshes.Mesh,
+    fabric: Fabric,
+    *,
+    seed: int,
+    kernel: str | None = None,
+    hanging: Hang = hung,
+) -> Hung:
+    """Return the shape in which the cloth hangs at rest under its holders, over the floor.
+
+    `hanging` lets it hang.
+    """
     # The flat cloth hangs upright in the plane x = 0, so that it faces the direction of the drag.
     flat = np.zeros((len(mesh.rest), 3))
     flat[:, 1] = mesh.rest[:, 0]
     flat[:, 2] = mesh.rest[:, 1] + SIDE / 2 + CLEARANCE
-    return hung(
+    return hanging(
         mesh, fabric, flat, held_by_holders(mesh), normal=(1.0, 0.0, 0.0), seed=seed, kernel=kernel
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drag:
+    """A cloth that is lowered onto a plane and dragged to and fro: see `scene`.
+
+    Raises:
+        ValueError: A number breaks its rule.
+    """
+
+    fabric: Fabric
+    mu: float
+    static_ratio: float = 1.0
+    """Coefficient of friction of what rests, over `mu`; 1 ... 3."""
+
+    mesh: meshes.Mesh
+    self_friction: float | None = SELF_FRICTION
+    preset: SolverSettings
+    frames: int = FRAMES
+    seed: int = 0
+    kernel: str | None = None
+    speed: float = 1.0
+    """Factor of the speed of the holders, 0.1 ... 10: their time runs as much faster."""
+
+    def __post_init__(self) -> None:
+        check_range("frames", self.frames, 1, FRAMES)
+        check_range("speed", self.speed, *FACTORS)
+        check_range("static_ratio", self.static_ratio, 1.0, STATIC_RATIO_MAX)
+
+    @property
+    def floor(self) -> Body:
+        """The floor, with friction of its own at rest if that is larger."""
+        floor = plane(self.mu)
+        if self.static_ratio == 1.0:
+            return floor
+        return replace(floor, mu_static=self.static_ratio * self.mu)
+
+    def pose(self, time: ArrayLike) -> Floats:
+        """Return the pose of the holders at a time or times [s]: ([T,] 3, 4)."""
+        return holder_pose(self.speed * np.asarray(time, float))
+
+    def scene(self, hanging: Hang = hung) -> Scene:
+        """Return the scene. `hanging` lets the cloth hang."""
+        cloth = hang(self.mesh, self.fabric, seed=self.seed, kernel=self.kernel, hanging=hanging)
+        floor = self.floor
+        return Scene(
+            mesh=self.mesh,
+            fabrics=[self.fabric],
+            preset=replace(self.preset, second_order=SECOND_ORDER),
+            start=cloth.positions,
+            holders=[Holder(cloth.held, self.pose)],
+            motion=motion_of(cloth, floor),
+            poses=lambda times: np.broadcast_to(floor.pose, (len(times), 1, 3, 4)),
+            self_contact=None if self.self_friction is None else SelfContact(self.self_friction),
+            frames=self.frames,
+            frame_rate=FRAME_RATE,
+            forces=lambda solver: _forces(solver, cloth),
+            tracks={"holder_pose": self.pose},
+            labels=lambda run: _labels(run, cloth, self.fabric),
+            kernel=self.kernel,
+            reason=cloth.reason,
+            hangings=[Hanging(0, 0, self.mesh, self.fabric, cloth)],
+        )
 
 
 def scene(
@@ -136,48 +223,94 @@ def scene(
     Raises:
         ValueError: An argument breaks its rule.
     """
-    check_range("frames", frames, 1, FRAMES)
-    if not isinstance(mesh, meshes.Mesh):
-        check_range("mesh", mesh, 5, np.inf)
-        # `mesh` counts vertices, and a grid takes cells.
-        mesh = meshes.grid(SIDE, SIDE, mesh - 1, mesh - 1)
-    made = fabric(material) if isinstance(material, str) else material
-    cloth = hang(mesh, made, seed=seed, kernel=kernel)
-    return Scene(
-        mesh=mesh,
-        fabrics=[made],
-        # The cloth flops over at each turn of the holders and comes to rest while it is dragged. An
-        # undamped flop takes more steps, and its rest is the same.
-        preset=replace(preset_named(preset), second_order=False),
-        start=cloth.positions,
-        holders=[Holder(cloth.held, holder_pose)],
-        motion=motion_of(cloth, mu),
-        poses=lambda times: np.broadcast_to(plane(mu).pose, (len(times), 1, 3, 4)),
-        self_contact=None if self_friction is None else SelfContact(self_friction),
+    return Drag(
+        fabric=fabric(material) if isinstance(material, str) else material,
+        mu=mu,
+        mesh=_square(mesh),
+        self_friction=self_friction,
+        preset=preset_named(preset),
         frames=frames,
-        frame_rate=FRAME_RATE,
-        forces=lambda solver: _forces(solver, cloth),
-        tracks={"holder_pose": holder_pose},
-        labels=lambda run: _labels(run, cloth, made),
+        seed=seed,
         kernel=kernel,
-        reason=cloth.reason,
+    ).scene()
+
+
+def _square(mesh: int | meshes.Mesh) -> meshes.Mesh:
+    if isinstance(mesh, meshes.Mesh):
+        return mesh
+    check_range("mesh", mesh, 5, np.inf)
+    # `mesh` counts vertices, and a grid takes cells.
+    return meshes.grid(SIDE, SIDE, mesh - 1, mesh - 1)
+
+
+def family(
+    material: str | Fabric,
+    mu: float,
+    *,
+    static_ratio: float = 1.0,
+    density: float = 1.0,
+    bending: float = 1.0,
+    stretching: float = 1.0,
+    speed: float = 1.0,
+    **settings: Any,
+) -> SceneFamily:
+    """Return the scenes of dragged cloth that differ in friction, fabric and speed.
+
+    Args:
+        material: One of `fabric_names()`, or a fabric.
+        mu: Coefficient of friction between cloth and floor, 0 ... 10.
+        static_ratio: Coefficient of friction of what rests, over `mu`; 1 ... 3.
+        density: Factor of the mass per area of the fabric, 0.1 ... 10.
+        bending: Factor of its bending rigidity, likewise.
+        stretching: Factor of its stretching stiffness, likewise.
+        speed: Factor of the speed of the holders, likewise.
+        settings: Other arguments of `scene`.
+    """
+    made = fabric(material) if isinstance(material, str) else material
+    mesh, preset = settings.pop("mesh", 41), settings.pop("preset", "certified")
+    drag = Drag(fabric=made, mu=mu, mesh=_square(mesh), preset=preset_named(preset), **settings)
+
+    def make(values: Mapping[str, float], hanging: Hang) -> Scene:
+        factors = {name: values[name] for name in ("density", "bending", "stretching")}
+        varied = replace(
+            drag,
+            fabric=made.scaled(**factors),
+            mu=values["mu"],
+            static_ratio=values["static_ratio"],
+            speed=values["speed"],
+        )
+        return varied.scene(hanging)
+
+    factors = {"density": density, "bending": bending, "stretching": stretching, "speed": speed}
+    return SceneFamily(
+        {
+            "mu": SceneParameter(mu, 0.0, MU_MAX / static_ratio),
+            "static_ratio": SceneParameter(static_ratio, 1.0, STATIC_RATIO_MAX),
+            **{name: SceneParameter(value, *FACTORS) for name, value in factors.items()},
+        },
+        make,
     )
 
 
-KIND = cloth_kind(scene)
+def _of_physics(*, sensitivities: Sequence[str] = (), **physics: Any) -> Scene:
+    """Return the scene of physics, differentiated by the parameters that it names."""
+    return family(**physics).differentiated(sensitivities)
 
 
-def motion_of(hung: Hung, mu: float) -> Callable[[float], tuple[Floats, Sequence[Body]]]:
-    """Return the motion over a floor of friction mu.
+KIND = cloth_kind(_of_physics)
+
+
+def motion_of(hung: Hung, floor: Body) -> Callable[[float], tuple[Floats, Sequence[Body]]]:
+    """Return the motion over a floor.
 
     Gravity is upright from one second after the drop on.
     """
-    floor = [plane(mu)]
+    bodies = [floor]
 
     def motion(time: float) -> tuple[Floats, Sequence[Body]]:
         # The tilt fades out within a second, so that gravity does not jump.
         upright = min(max(time - duration_of(DROP), 0.0), 1.0)
-        return np.array([0.0, 0.0, -GRAVITY]) + hung.tilt * GRAVITY * (1.0 - upright), floor
+        return np.array([0.0, 0.0, -GRAVITY]) + hung.tilt * GRAVITY * (1.0 - upright), bodies
 
     return motion
 

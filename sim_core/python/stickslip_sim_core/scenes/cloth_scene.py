@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,19 +11,37 @@ from numpy.typing import NDArray
 from stickslip_sim_core._sim_core import sheet_count
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
-from stickslip_sim_core.cloth.contact import SelfContact
+from stickslip_sim_core.cloth.contact import Friction, SelfContact
 from stickslip_sim_core.cloth.presets import preset_named
 from stickslip_sim_core.cloth.solver import Cloth
-from stickslip_sim_core.scenes.holders import Holder
+from stickslip_sim_core.scenes.family import SceneFamily, SceneParameter
+from stickslip_sim_core.scenes.holders import Hang, Hanging, Holder, hung
 from stickslip_sim_core.scenes.kind import IMPOSSIBLE_START, Kind, OnFrame, Outcome, Record
 from stickslip_sim_core.scenes.parts import Document, Sheet, Thing, sheet, thing
 from stickslip_sim_core.scenes.scene import ClothRun, Scene, cloth_kernel, fabric_labels
+from stickslip_sim_core.scenes.sensitivities import positions_by
+
+FrictionOfPairs = Mapping[tuple[str, str], Friction]
+"""Friction by the names of a sheet and of another sheet or a body."""
+
+
+class FamilyParameter(NamedTuple):
+    """A number of a document that scenes of a family differ in."""
+
+    places: Sequence[Sequence[str | int]]
+    """Where the number is: names, and positions in lists. It is the same at all places."""
+    low: float
+    high: float
+    unit: str = "1"
+
 
 UPRIGHT = 1.0
 """Time in which gravity turns upright over a hung sheet after its bias ends [s]."""
 
 
-def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Scene:
+def scene(
+    document: Document, *, seed: int = 0, kernel: str | None = None, hang: Hang = hung
+) -> Scene:
     """Return the scene of a document.
 
     The document is `Physics` of stickslip_schemas.scene, as JSON, with arrays in place of files.
@@ -42,14 +60,15 @@ def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Sc
     - `BODY.rest` and `BODY.triangles` of a body of triangles, and `BODY.vertices` (frame, vertex,
       3) [m] if it deforms
 
-    `seed` draws the biases that break the symmetry of the scene. For `kernel`, see `Cloth`.
+    `seed` draws the biases that break the symmetry of the scene. For `kernel`, see `Cloth`. `hang`
+    lets sheets hang.
 
     Raises:
         ValueError: A value breaks its rule. The message begins with the place of the value.
     """
-    mu = _friction(document)
-    sheets = _sheets(document, seed, kernel)
-    things = _things(document, sheets, mu)
+    friction = _friction(document)
+    sheets = _sheets(document, seed, kernel, hang)
+    things = _things(document, sheets, friction)
     held = _held(sheets)
     gravity = _Gravity(document, sheets, seed)
     # Surfaces move as `Surface` objects, so `motion` and `poses` have rigid bodies only.
@@ -66,7 +85,7 @@ def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Sc
             np.reshape([pose(times) for pose in rigid_poses], (-1, len(times), 3, 4)), 0, 1
         ),
         holders=held.holders,
-        self_contact=_touch(document, sheets, mu),
+        self_contact=_touch(document, sheets, friction),
         surfaces=[body.surface for body in things if body.surface is not None],
         damping=lambda time: calm["rate"] if calm is not None and time <= calm["until"] else 0.0,
         frames=_frames(document),
@@ -84,10 +103,11 @@ def scene(document: Document, *, seed: int = 0, kernel: str | None = None) -> Sc
             *(f"sheets.{part.name}" for part in sheets),
         ],
         reason=_hanging_fault(sheets),
+        hangings=_hangings(sheets),
     )
 
 
-def _sheets(document: Document, seed: int, kernel: str | None) -> list[Sheet]:
+def _sheets(document: Document, seed: int, kernel: str | None, hang: Hang) -> list[Sheet]:
     """Return the sheets in the order of their names."""
     sheets = []
     for name, described in sorted(document["sheets"].items()):
@@ -98,6 +118,7 @@ def _sheets(document: Document, seed: int, kernel: str | None) -> list[Sheet]:
             gravity=document["gravity"],
             seed=seed,
             kernel=kernel,
+            hang=hang,
         )
         # The solver counts every connected piece as a sheet. Two pieces under one name would shift
         # the numbers of all later sheets.
@@ -107,14 +128,12 @@ def _sheets(document: Document, seed: int, kernel: str | None) -> list[Sheet]:
     return sheets
 
 
-def _things(
-    document: Document, sheets: Sequence[Sheet], mu: Mapping[tuple[str, str], float]
-) -> list[Thing]:
+def _things(document: Document, sheets: Sequence[Sheet], friction: FrictionOfPairs) -> list[Thing]:
     """Return the bodies in the order of their names, with their friction by sheet."""
     cell = max(part.mesh.spacing for part in sheets)
     things = []
     for name, body in sorted(document["bodies"].items()):
-        by_sheet = [mu[part.name, name] for part in sheets]
+        by_sheet = [friction[part.name, name] for part in sheets]
         things.append(thing(name, body, by_sheet, cell=cell))
     return things
 
@@ -182,6 +201,17 @@ def _tracks(things: Sequence[Thing], held: _Held) -> dict[str, Callable[[float],
     return tracks
 
 
+def _hangings(sheets: Sequence[Sheet]) -> list[Hanging]:
+    """Return the sheets that hang at the start."""
+    hangings = []
+    begins = _vertex_begins(sheets)
+    for number, part in enumerate(sheets):
+        if part.hung is not None:
+            begin = int(begins[number])
+            hangings.append(Hanging(number, begin, part.mesh, part.fabric, part.hung))
+    return hangings
+
+
 def _hanging_fault(sheets: Sequence[Sheet]) -> str:
     """Return why a hung sheet has no stable start, or an empty text if all have one."""
     for part in sheets:
@@ -190,19 +220,27 @@ def _hanging_fault(sheets: Sequence[Sheet]) -> str:
     return ""
 
 
-def _friction(document: Document) -> dict[tuple[str, str], float]:
-    """Return the coefficient of friction of each sheet with each sheet and body."""
-    pairs = {frozenset(pair["between"]): pair["mu"] for pair in document["friction"]}
-    default: float = document["default_friction"] or 0.0
-    mu = {}
+def _friction(document: Document) -> dict[tuple[str, str], Friction]:
+    """Return the friction of each sheet with each sheet and body."""
+    pairs = {frozenset(pair["between"]): _friction_of(pair) for pair in document["friction"]}
+    default = float(document["default_friction"] or 0.0)
+    friction = {}
     for names in product(document["sheets"], (*document["sheets"], *document["bodies"])):
         # A pair has no order. A sheet with itself is a set of a single name.
-        mu[names] = float(pairs.get(frozenset(names), default))
-    return mu
+        friction[names] = pairs.get(frozenset(names), Friction(default, default))
+    return friction
+
+
+def _friction_of(pair: Document) -> Friction:
+    """Return the friction of a pair of the document, which has `mu`, or both coefficients."""
+    mu = pair.get("mu")
+    if mu is not None:
+        return Friction(float(mu), float(mu))
+    return Friction(float(pair["kinetic"]), float(pair["static"]))
 
 
 def _touch(
-    document: Document, sheets: Sequence[Sheet], mu: Mapping[tuple[str, str], float]
+    document: Document, sheets: Sequence[Sheet], friction: FrictionOfPairs
 ) -> SelfContact | None:
     """Return the contact of cloth with cloth, or None if the only sheet has no self-contact."""
     names = [part.name for part in sheets]
@@ -215,10 +253,13 @@ def _touch(
         )
     if without:
         return None
-    friction = []
-    for name in names:
-        friction.append([mu[name, other] for other in names])
-    return SelfContact(friction, [part.thickness for part in sheets], document["bearing"])
+    by_names = np.array([[friction[name, other] for other in names] for name in names], float)
+    return SelfContact(
+        by_names[..., 0],
+        [part.thickness for part in sheets],
+        document["bearing"],
+        mu_static=by_names[..., 1],
+    )
 
 
 class _Gravity:
@@ -369,6 +410,10 @@ def _arrays(run: ClothRun, sheets: Sequence[Sheet], things: Sequence[Thing]) -> 
         arrays[f"{part.name}.positions"] = positions
         arrays[f"{part.name}.rest"] = part.mesh.rest
         arrays[f"{part.name}.triangles"] = part.mesh.triangles
+    for name, derivatives in positions_by(run.sensitivities).items():
+        of_sheets = np.split(derivatives, inner_begins, axis=1)
+        for part, of_sheet in zip(sheets, of_sheets, strict=True):
+            arrays[f"{part.name}.{name}"] = of_sheet
     for body in things:
         if body.surface is not None:
             arrays[f"{body.name}.rest"] = body.rest
@@ -391,14 +436,62 @@ def _labels(
     return labels
 
 
+def family(
+    document: Document,
+    parameters: Mapping[str, FamilyParameter],
+    *,
+    seed: int = 0,
+    kernel: str | None = None,
+) -> SceneFamily:
+    """Return the scenes of a document that differ in the numbers at some places.
+
+    Args:
+        document: As of `scene`.
+        parameters: For each name the places in the document of one number, and its range.
+        seed: As of `scene`.
+        kernel: As of `scene`.
+    """
+    known = {}
+    for name, (places, low, high, unit) in parameters.items():
+        known[name] = SceneParameter(float(_value_at(document, places[0])), low, high, unit)
+
+    def make(values: Mapping[str, float], hang: Hang) -> Scene:
+        changed = document
+        for name, value in values.items():
+            for place in parameters[name].places:
+                changed = _with_value(changed, place, value)
+        return scene(changed, seed=seed, kernel=kernel, hang=hang)
+
+    return SceneFamily(known, make)
+
+
+def _value_at(document: Any, place: Sequence[str | int]) -> Any:
+    for step in place:
+        document = document[step]
+    return document
+
+
+def _with_value(document: Any, place: Sequence[str | int], value: float) -> Any:
+    """Return a document with another value at a place; it shares all else with the first one."""
+    if not place:
+        return value
+    step, *further = place
+    copy: Any = dict(document) if isinstance(document, Mapping) else list(document)
+    copy[step] = _with_value(document[step], further, value)
+    return copy
+
+
 def _simulated(scene_and_seed: Mapping[str, Any], on_frame: OnFrame | None) -> Outcome:
     """Return the outcome of a simulation.
 
     Values that do not fit together are a reason to reject the simulation before it starts. A later
     error is a bug, and the caller gets it.
     """
+    asked = scene_and_seed.get("sensitivities", {})
+    parameters = {name: FamilyParameter(*places) for name, places in asked.items()}
     try:
-        simulated_scene = scene(scene_and_seed["scene"], seed=scene_and_seed["seed"])
+        scenes = family(scene_and_seed["scene"], parameters, seed=scene_and_seed["seed"])
+        simulated_scene = scenes.differentiated(tuple(parameters))
     except ValueError as error:
         return Outcome(reason=str(error), code=IMPOSSIBLE_START)
     return simulated_scene.outcome(on_frame)

@@ -37,6 +37,10 @@ class Frame(NamedTuple):
     crossings: int
     """Number of pairs of triangles of the cloth that cross, or 0 without finite positions."""
 
+    time: float
+    straight: bool = False
+    """Whether the positions are linear in time between the ends of the step."""
+
 
 def frame_at(cloth: Cloth, time: float, bodies: Bodies) -> Frame:
     """Return the frame at a time [s] in the last step of `Cloth.advance`.
@@ -46,11 +50,11 @@ def frame_at(cloth: Cloth, time: float, bodies: Bodies) -> Frame:
     """
     smooth = cloth.positions_at(time)
     if not np.isfinite(smooth).all():
-        return Frame(smooth, 0)
+        return Frame(smooth, 0, time)
     crossings = self_intersections(smooth, cloth.mesh.triangles)
     # The end of a step is a result of the solver, and is shown as it is.
     if time == cloth.time:
-        return Frame(smooth, crossings)
+        return Frame(smooth, crossings, time)
     here = bodies(time)
     straight = cloth.positions_at(time, straight=True)
     if (
@@ -60,7 +64,8 @@ def frame_at(cloth: Cloth, time: float, bodies: Bodies) -> Frame:
     ):
         smooth = _out_of_bodies(cloth, straight, here, bodies)
         crossings = self_intersections(smooth, cloth.mesh.triangles)
-    return Frame(smooth, crossings)
+        return Frame(smooth, crossings, time, straight=True)
+    return Frame(smooth, crossings, time)
 
 
 def _depths(positions: Floats, bodies: Sequence[Body]) -> Floats:

@@ -3,8 +3,9 @@
 `hung` returns the shape in which a cloth hangs at rest under its holders.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -80,6 +81,11 @@ class Hands:
                 points_by_holder[number] = self._points_by_holder.get(number, place)
         self._points_by_holder = points_by_holder
         return self.vertices
+
+    @property
+    def points(self) -> Mapping[int, Floats]:
+        """Places of held vertices in the axes of their holders (K, 3) [m], by number of holder."""
+        return self._points_by_holder
 
     @property
     def vertices(self) -> NDArray[np.int32]:
@@ -169,8 +175,61 @@ class Hung:
     It breaks the symmetry of the motion that follows.
     """
 
+    gravity: Floats
+    """Acceleration of gravity under which it hangs, with the tilt: (V, 3) [m/s^2]."""
+
     reason: str
     """Reason why the shape is no stable equilibrium, or empty."""
+
+
+class Hang(Protocol):
+    """A way to let a flat cloth hang: `hung`, or `flat_under_tilt`."""
+
+    def __call__(
+        self,
+        mesh: meshes.Mesh,
+        fabric: Fabric,
+        flat: Floats,
+        held: NDArray[np.intp],
+        *,
+        normal: ArrayLike,
+        seed: int,
+        gravity: ArrayLike = (0.0, 0.0, -GRAVITY),
+        kernel: str | None = None,
+    ) -> Hung: ...
+
+
+def flat_under_tilt(
+    mesh: meshes.Mesh,
+    fabric: Fabric,
+    flat: Floats,
+    held: NDArray[np.intp],
+    *,
+    normal: ArrayLike,
+    seed: int,
+    gravity: ArrayLike = (0.0, 0.0, -GRAVITY),
+    kernel: str | None = None,
+) -> Hung:
+    """Return the cloth that `hung` takes, still flat, with the tilt that it would hang under.
+
+    Arguments and errors are those of `hung`. Nothing is simulated, so it serves for scenes of which
+    only the holders and the tilt are needed.
+    """
+    size = float(np.linalg.norm(np.asarray(gravity, float)))
+    # Without a weight the cloth would keep its flat shape, which is no shape of hanging.
+    if not size > 0.0:
+        raise ValueError(
+            f"gravity: cloth can only hang under gravity, got {np.asarray(gravity).tolist()} m/s^2"
+        )
+    rng = np.random.default_rng(seed)
+    side = 1 if rng.random() < 0.5 else -1
+    bias = float(rng.uniform(1e-3, 3e-3))
+    # The tilt differs from left to right by up to 30 %, so that no mirror symmetry remains either.
+    twist = float(rng.uniform(-0.3, 0.3))
+    tilt = side * bias * (1.0 + twist * mesh.rest[:, 0] / np.abs(mesh.rest[:, 0]).max())
+    tilts = tilt[:, None] * np.asarray(normal, float)
+    down = np.tile(np.asarray(gravity, float), (len(mesh.rest), 1))
+    return Hung(flat, held, side, bias, tilts, down + tilts * size, "")
 
 
 def hung(
@@ -205,24 +264,16 @@ def hung(
     Raises:
         ValueError: Gravity is zero.
     """
-    weight = np.asarray(gravity, float)
-    size = float(np.linalg.norm(weight))
-    # Without a weight the cloth would keep its flat shape, which is no shape of hanging.
-    if not size > 0.0:
-        raise ValueError(f"gravity: cloth can only hang under gravity, got {weight.tolist()} m/s^2")
+    begin = flat_under_tilt(
+        mesh, fabric, flat, held, normal=normal, seed=seed, gravity=gravity, kernel=kernel
+    )
+    size = float(np.linalg.norm(np.asarray(gravity, float)))
+    down = np.tile(np.asarray(gravity, float), (len(mesh.rest), 1))
     cloth = Cloth(mesh, fabric, HANGING, held=held, kernel=kernel)
-    rng = np.random.default_rng(seed)
-    side = 1 if rng.random() < 0.5 else -1
-    bias = float(rng.uniform(1e-3, 3e-3))
-    # The tilt differs from left to right by up to 30 %, so that no mirror symmetry remains either.
-    twist = float(rng.uniform(-0.3, 0.3))
-    tilt = side * bias * (1.0 + twist * mesh.rest[:, 0] / np.abs(mesh.rest[:, 0]).max())
-    tilts = tilt[:, None] * np.asarray(normal, float)
-    down = np.tile(weight, (len(mesh.rest), 1))
     cloth.set_state(flat)
     dt = FIRST_STEP
     for times in HANGING_TILTS:
-        cloth.gravity = down + times * tilts * size
+        cloth.gravity = down + times * begin.tilt * size
         for _ in range(SETTLING_STEPS):
             cloth.step(dt, held=flat[held], damping=SETTLING_DAMPING)
             dt = min(GROWTH * dt, HANGING.time_step)
@@ -242,4 +293,17 @@ def hung(
         reason = f"the hung cloth did not come to rest: it moved by {moved:.1e} m in {dt:g} s"
     elif not softest > 0.0:
         reason = f"the hung cloth is not stable: its softest eigenvalue is {softest:.2g} 1/s^2"
-    return Hung(cloth.positions, held, side, bias, tilts, reason)
+    return replace(begin, positions=cloth.positions, reason=reason)
+
+
+class Hanging(NamedTuple):
+    """A sheet of a scene that hangs at the start."""
+
+    sheet: int
+    """Its number."""
+    begin: int
+    """Number of its first vertex among those of all sheets."""
+
+    mesh: meshes.Mesh
+    fabric: Fabric
+    hung: Hung

@@ -4,7 +4,7 @@ The document is `Physics` of stickslip_schemas.scene, as JSON, with arrays in pl
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.contact import (
     Body,
+    Friction,
     Surface,
     box,
     capsule,
@@ -23,7 +24,7 @@ from stickslip_sim_core.cloth.contact import (
     sphere,
 )
 from stickslip_sim_core.cloth.fabrics import Fabric, custom_fabric, fabric
-from stickslip_sim_core.scenes.holders import ALWAYS, Holder, Hung, hung
+from stickslip_sim_core.scenes.holders import ALWAYS, Hang, Holder, Hung, hung
 from stickslip_sim_core.scenes.motions import Keyframes, MovingMesh, RigidMotion, Spin, rotation
 
 Document = Mapping[str, Any]
@@ -70,10 +71,11 @@ def sheet(
     gravity: ArrayLike,
     seed: int,
     kernel: str | None,
+    hang: Hang = hung,
 ) -> Sheet:
     """Return a sheet of a document. `materials` are its custom fabrics.
 
-    Hung cloth hangs under `gravity` (3,) [m/s^2], and `seed` draws its tilt.
+    Hung cloth hangs under `gravity` (3,) [m/s^2], and `seed` draws its tilt. `hang` lets it hang.
 
     Raises:
         ValueError: A value breaks its rule. The message begins with the place of the value.
@@ -128,7 +130,7 @@ def sheet(
     # Holders take the hung cloth at its flat positions: `hung` does not move held vertices.
     hanging = None
     if begin["type"] == "hung":
-        hanging = hung(
+        hanging = hang(
             mesh,
             cloth_fabric,
             start,
@@ -260,17 +262,21 @@ class Thing:
     """Whether the vertices of a surface move relative to its axes."""
 
 
-def thing(name: str, document: Document, mu: Sequence[float], *, cell: float) -> Thing:
+def thing(name: str, document: Document, friction: Sequence[Friction], *, cell: float) -> Thing:
     """Return a body of a document.
 
-    `mu` has its coefficients of friction with each sheet. `cell` is the largest side of a cell of a
+    `friction` is that with each sheet. `cell` is the largest side of a cell of a
     sheet [m].
 
     Raises:
         ValueError: A value breaks its rule. The message begins with the place of the value.
     """
+    mu = [of_sheet.kinetic for of_sheet in friction]
+    resting = [of_sheet.static for of_sheet in friction]
+    mu_static = None if resting == mu else resting
     if document["type"] == "plane":
         still = plane(mu, normal=document["normal"], origin=document["origin"])
+        still = _with_static_friction(still, mu_static)
         return Thing(
             name,
             lambda time: np.broadcast_to(still.pose, (*np.shape(time), 3, 4)),
@@ -278,7 +284,7 @@ def thing(name: str, document: Document, mu: Sequence[float], *, cell: float) ->
             lambda _time: still,
         )
     if document["type"] == "mesh":
-        return _surface(name, document, mu)
+        return _surface(name, document, mu, mu_static)
     origin = np.array(document["origin"], float)
     motion = rigid_motion(document["motion"], origin)
     pose = _carried(motion, rotation(document["turn"]), origin)
@@ -297,12 +303,19 @@ def thing(name: str, document: Document, mu: Sequence[float], *, cell: float) ->
 
     def rigid(time: float) -> Body:
         now = pose(time)
-        return make_body(origin=now[:, 3], rotation=now[:, :3])
+        return _with_static_friction(make_body(origin=now[:, 3], rotation=now[:, :3]), mu_static)
 
     return Thing(name, pose, motion.last, rigid=rigid)
 
 
-def _surface(name: str, document: Document, mu: Sequence[float]) -> Thing:
+def _with_static_friction(body: Body, mu_static: Sequence[float] | None) -> Body:
+    """Return a body with other friction at rest; None is that of what slides."""
+    return body if mu_static is None else replace(body, mu_static=mu_static)
+
+
+def _surface(
+    name: str, document: Document, mu: Sequence[float], mu_static: Sequence[float] | None
+) -> Thing:
     # Errors of the mesh and of the surface do not have the name of the body, so add it.
     try:
         file = document["file"]
@@ -321,7 +334,7 @@ def _surface(name: str, document: Document, mu: Sequence[float]) -> Thing:
             pose = motion.pose(time)
             return np.asarray(mesh.at(time) @ pose[:, :3].T + pose[:, 3])
 
-        surface = Surface(mesh.triangles, at, list(mu), document["thickness"])
+        surface = Surface(mesh.triangles, at, list(mu), document["thickness"], mu_static=mu_static)
     except ValueError as error:
         raise ValueError(f"bodies.{name}: {error}") from error
     last = max(motion.last, mesh.last)

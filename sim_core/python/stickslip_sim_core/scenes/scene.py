@@ -17,8 +17,16 @@ from stickslip_sim_core.cloth.presets import SolverSettings
 from stickslip_sim_core.cloth.solver import Cloth
 from stickslip_sim_core.scenes.evenness import uneven_until
 from stickslip_sim_core.scenes.frames import Frame, frame_at
-from stickslip_sim_core.scenes.holders import Hands, Holder
+from stickslip_sim_core.scenes.holders import Hands, Hanging, Holder
 from stickslip_sim_core.scenes.kind import IMPOSSIBLE_START, Array, Kind, OnFrame, Outcome, Record
+from stickslip_sim_core.scenes.sensitivities import (
+    AtFrame,
+    Followed,
+    SceneSensitivity,
+    Sensitivity,
+    events_of,
+    positions_by,
+)
 
 REST_SPEED = 1e-3
 """Largest mean speed of a vertex between two frames at which cloth is at rest [m/s]."""
@@ -76,6 +84,9 @@ class ClothRun:
     reason: str
     """The reason in words, or empty."""
 
+    sensitivities: Mapping[str, Sensitivity] = field(default_factory=dict)
+    """Derivatives by the parameters that the scene was differentiated by, by their names."""
+
     @property
     def valid(self) -> bool:
         return not self.code
@@ -86,6 +97,7 @@ class Begun(NamedTuple):
 
     hands: Hands
     cloth: Cloth
+    followed: Followed
 
 
 @dataclass(eq=False, slots=True)
@@ -101,20 +113,25 @@ class _Frames:
     crossings: list[int] = field(default_factory=list)
     """Number of pairs of triangles that cross at each frame."""
 
+    derivatives: list[AtFrame] = field(default_factory=list)
+    """Derivatives by the parameters at each frame."""
+
     rest_time: float = np.nan
     """Time at which everything came to rest and ended the scene [s], or NaN."""
 
-    def add(self, frame: Frame, forces: Record) -> None:
+    def add(self, frame: Frame, forces: Record, derivatives: AtFrame) -> None:
         """Append a frame."""
         self.positions.append(frame.positions)
         self.crossings.append(frame.crossings)
         self.forces.append(forces)
+        self.derivatives.append(derivatives)
 
     def repeat_last(self, count: int) -> None:
         """Append the last frame `count` times."""
         self.positions += count * self.positions[-1:]
         self.crossings += count * self.crossings[-1:]
         self.forces += count * self.forces[-1:]
+        self.derivatives += count * self.derivatives[-1:]
 
     def record(self) -> Record:
         """Return the recorded arrays with the frames as their first axis."""
@@ -182,6 +199,7 @@ class Scene:
         "positions": run.positions,
         "rest": run.rest,
         "triangles": run.triangles,
+        **positions_by(run.sensitivities),
     }
     """Function that returns the arrays of the run to store besides its record."""
 
@@ -199,6 +217,12 @@ class Scene:
 
     reason: str = ""
     """Reason why no run of the scene is valid, or empty."""
+
+    hangings: Sequence[Hanging] = ()
+    """Sheets that hang at the start."""
+
+    sensitivities: Sequence[SceneSensitivity] = ()
+    """What a run is differentiated by: see `SceneFamily.differentiated`."""
 
     def begin(self) -> Begun:
         """Return the cloth at the start of the scene, and its holders.
@@ -218,7 +242,7 @@ class Scene:
             kernel=self.kernel,
         )
         cloth.set_state(self.start, bodies=self.motion(0.0)[1])
-        return Begun(hands, cloth)
+        return Begun(hands, cloth, Followed(self.sensitivities, hands, cloth))
 
     def run(self, on_frame: OnFrame | None = None, begun: Begun | None = None) -> ClothRun:
         """Simulate the scene until it ends, or until a check has failed.
@@ -229,8 +253,9 @@ class Scene:
         Raises:
             ValueError: The scene cannot begin.
         """
-        hands, cloth = self.begin() if begun is None else begun
-        frames = self._simulate(cloth, hands, on_frame)
+        begun = self.begin() if begun is None else begun
+        hands, cloth, followed = begun
+        frames = self._simulate(begun, on_frame)
         path = np.stack(frames.positions)
         times = np.arange(len(path)) / self.frame_rate
         evidence = self._evidence(frames, cloth, hands)
@@ -251,31 +276,35 @@ class Scene:
                 "unconverged_steps": cloth.total.unconverged,
                 "worst_residual": cloth.worst_residual,
                 **worst,
+                **followed.labels(frames.derivatives),
             },
             self_intersections=np.array(frames.crossings, np.int32),
             least_distance=cloth.total.least_distance,
             rest_time=frames.rest_time,
             code=code,
             reason=reason,
+            sensitivities=followed.over_frames(frames.derivatives),
         )
         # Labels of the scene may depend on the run, such as the side on which a cloth landed.
         return replace(run, labels={**run.labels, **self.labels(run)})
 
-    def _simulate(self, cloth: Cloth, hands: Hands, on_frame: OnFrame | None) -> _Frames:
+    def _simulate(self, begun: Begun, on_frame: OnFrame | None) -> _Frames:
         """Return the frames up to the end of the scene, or until a check has failed."""
+        _, cloth, followed = begun
         verdict = checks.Verdict(cloth)
         frames = _Frames()
-        frames.add(frame_at(cloth, 0.0, self._bodies), self.forces(cloth))
+        first = frame_at(cloth, 0.0, self._bodies)
+        frames.add(first, self.forces(cloth), followed.at_frame(first))
         calm = 0
         # No run of a scene with a reason is valid, so it has its first frame alone.
         for number in range(1, 1 if self.reason else self.frames):
             time = number / self.frame_rate
-            self._advance(cloth, hands, time, verdict)
+            self._advance(begun, time, verdict)
             # A check has failed, or the budget is spent, and the cloth has not reached the frame.
             if cloth.time < time:
                 break
             frame = frame_at(cloth, time, self._bodies)
-            frames.add(frame, self.forces(cloth))
+            frames.add(frame, self.forces(cloth), followed.at_frame(frame))
             if on_frame is not None:
                 on_frame(number + 1, self.frames)
             if verdict.see_frame(frame.crossings if self.self_contact else 0):
@@ -317,17 +346,24 @@ class Scene:
             return False
         return float(np.linalg.norm(now - before, axis=1).max()) <= REST_SPEED / self.frame_rate
 
-    def _advance(self, cloth: Cloth, hands: Hands, end: float, verdict: checks.Verdict) -> None:
+    def _advance(self, begun: Begun, end: float, verdict: checks.Verdict) -> None:
         """Take steps until one ends at `end` [s] or later, and grasp and release on the way.
 
         A lost run stops before.
         """
+        hands, cloth, followed = begun
         poses = self.poses
+
+        def see_step() -> bool:
+            followed.see_step()
+            return verdict.see_step()
+
         path = None if poses is None else lambda times: (hands.at(times), poses(times))
         while cloth.time < end and cloth.spent <= 1.0 and not verdict.is_lost:
             # A step ends exactly at each event, so equal times are a safe test.
             if cloth.time in hands.events:
                 cloth.hold(hands.take(cloth.time, cloth.positions), self.motion(cloth.time)[1])
+                followed.take(cloth.time)
             event = min((event for event in hands.events if event > cloth.time), default=np.inf)
             cloth.advance(
                 min(end, event),
@@ -335,7 +371,7 @@ class Scene:
                 path=path,
                 event=event,
                 damping=self.damping,
-                is_over=verdict.see_step,
+                is_over=see_step,
                 may_fail=verdict.allows_failure,
             )
 
@@ -358,7 +394,7 @@ class Scene:
             return Outcome(reason=f"{run.reason}; worst values: {worst}", code=run.code)
         # Cut off rather than wrapped around to negative numbers.
         crossings = np.minimum(run.self_intersections, np.iinfo(np.int16).max).astype(np.int16)
-        arrays: Record = {**self.arrays(run), **run.record}
+        arrays: Record = {**self.arrays(run), **run.record, **events_of(run.sensitivities)}
         single = {
             name: a.astype(np.float32) if a.dtype.kind == "f" else a for name, a in arrays.items()
         }
@@ -394,10 +430,9 @@ def cloth_kind(scene: Callable[..., Scene]) -> Kind:
 
 
 def _of_materials(physics: Mapping[str, Any]) -> dict[str, Any]:
-    """Return physics with a fabric instead of its name, custom numbers and factors."""
+    """Return physics with a fabric instead of its name and custom numbers."""
     known = dict(physics)
-    factors = {name: known.pop(name, 1.0) for name in ("density", "bending", "stretching")}
     name = known.pop("material")
     numbers = known.pop("fabric", None)
     made = fabric(name) if numbers is None else custom_fabric(name, **numbers)
-    return {**known, "material": made.scaled(**factors)}
+    return {**known, "material": made}
