@@ -19,6 +19,9 @@ from stickslip_sim_core.scenes.frames import Frame
 from stickslip_sim_core.scenes.holders import Hands, Holder
 from stickslip_sim_core.scenes.kind import Record
 
+UNSOLVED = 1e-2
+"""Relative change in the last round of solving a step from which on derivatives are lost."""
+
 ONE_SIDED = 1e-4
 """Change of a parameter, over its size, within which an event makes a frame one-sided."""
 
@@ -82,7 +85,10 @@ class Sensitivity:
     """The derivative of a run by a parameter, at each frame."""
 
     positions: Floats
-    """Of positions: (frames, V, 3) [m per unit]."""
+    """Of positions: (frames, V, 3) [m per unit].
+
+    They are NaN from a step on whose derivatives could not be solved.
+    """
 
     nearest_event: Floats
     """How far the parameter may change until a contact changes its branch: (frames,).
@@ -175,6 +181,9 @@ class Followed:
         nearest = self._nearest
         self._nearest = np.full(len(self._by), np.inf)
         positions = self._cloth.sensitivities_at(frame.time, straight=frame.straight)
+        # All later derivatives are made from those of the step that was not solved.
+        if not self._change < UNSOLVED:
+            positions = np.full_like(positions, np.nan)
         return AtFrame(positions, nearest)
 
     def over_frames(self, frames: Sequence[AtFrame]) -> dict[str, Sensitivity]:
@@ -193,7 +202,7 @@ class Followed:
         """Return how well derivatives were solved, and how large each is.
 
         `largest_by_NAME` is the largest derivative of a coordinate [m per unit]. It is 0 if the
-        parameter has no effect.
+        parameter has no effect, and NaN if derivatives could not be solved.
         """
         if not self._by:
             return {}
