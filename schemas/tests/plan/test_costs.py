@@ -60,9 +60,9 @@ def test_packaged_costs_fit_the_jobs_that_they_were_taken_from(
     document: Any, stage: Stage, cost: float
 ) -> None:
     """Not a check of accuracy: these jobs gave the numbers. It holds the units and the counts."""
-    found = estimate(**document).stages[stage]
-    assert found.median == pytest.approx(cost, rel=0.4)
-    assert found.low < cost < found.high
+    estimated = estimate(**document).stages[stage]
+    assert estimated.median == pytest.approx(cost, rel=0.4)
+    assert estimated.low < cost < estimated.high
 
 
 def test_what_was_measured_replaces_what_is_usual() -> None:
@@ -114,11 +114,11 @@ def test_a_measured_stage_does_not_follow_the_speed() -> None:
 
 
 def test_textures_share_a_shading_and_nothing_is_rendered_without_views() -> None:
-    one, four = (
+    single, four = (
         estimate(**clips(*names)).stages[Stage.render].median
         for names in (["dots"], ["dots", "plaid"])
     )
-    assert four < 1.5 * one
+    assert four < 1.5 * single
     assert estimate(**(rods(20, "high") | {"views": None})).stages[Stage.render].high == 0.0
 
 

@@ -261,6 +261,7 @@ void bind_cloth(nb::module_& m) {
           },
           "time"_a, "event"_a, "conditions"_a, "table"_a, "may_fail"_a)
       .def("momentum_rate", &ClothSolver::momentum_rate)
+      .def("damping_force", &ClothSolver::damping_force)
       .def("positions", &ClothSolver::positions)
       .def("velocities", &ClothSolver::velocities)
       .def("reactions", &ClothSolver::reactions)

@@ -235,7 +235,11 @@ void Sensitivities::linearize_node(int parameter, int node, const Step& step,
   const Vector3d across = slip_change - slip_change.dot(t) * t;
   const double length = contact.slip.norm();
   double mu_change = own_rate + change.mu;
-  if (length > 0.0) mu_change += mu_by_direction(node, contact, step, -across / length);
+  // The direction turns by -across/length. A contact that hardly slips is as good as stuck, and
+  // turns no more than its bounded stiffness lets it.
+  const double bound = mu * load;
+  if (bound > 0.0)
+    mu_change += mu_by_direction(node, contact, step, -contact.turning / bound * across);
   Vector3d lacking = in_plane(force_change - normal_change * n - pressing * change.normal, n);
   lacking -= (coupling_[node] * load_change + mu_change * load) * t;
   lacking += contact.turning * across;

@@ -115,8 +115,8 @@ void Sensitivities::linearize_pairs(int parameter) {
   }
 }
 
-// Takes over the changes of the pairs' forces by the solution of a round.
-void Sensitivities::update_pair_forces() {
+// Finds how the solution of a round updates the changes of the pairs' forces.
+void Sensitivities::find_pair_updates() {
   const int free_nodes = assembly_.numbering.free_nodes;
   for (PairContact& contact : pairs_) {
     const Pair& pair = *contact.pair;
@@ -129,9 +129,29 @@ void Sensitivities::update_pair_forces() {
       motions.segment<3>(3) += pair.along_first[c] * d;
       motions.segment<3>(6) += pair.along_second[c] * d;
     }
-    contact.change +=
+    contact.update =
         contact.right_side - pair.row.stiffness * motions.head<3>() + pair.turning * motions;
   }
+}
+
+// Forces of pairs count as the lengths by which their law gives way to them, m.
+void Sensitivities::take_update() {
+  const int components = 4 * assembly_.numbering.free_nodes;
+  const int pairs = static_cast<int>(pairs_.size());
+  Eigen::VectorXd now(components + 3 * pairs), update(components + 3 * pairs);
+  for (int k = 0; k < components; ++k) {
+    now[k] = derivative_[k];
+    update[k] = solution_[k];
+  }
+  for (int p = 0; p < pairs; ++p) {
+    const double stiffness = pairs_[p].pair->proximal.normal;
+    now.segment<3>(components + 3 * p) = pairs_[p].change / stiffness;
+    update.segment<3>(components + 3 * p) = pairs_[p].update / stiffness;
+  }
+  const Eigen::VectorXd next = acceleration_.next(now, update);
+  for (int k = 0; k < components; ++k) derivative_[k] = next[k];
+  for (int p = 0; p < pairs; ++p)
+    pairs_[p].change = pairs_[p].pair->proximal.normal * next.segment<3>(components + 3 * p);
 }
 
 }  // namespace sim_core

@@ -18,7 +18,7 @@ constexpr double probe = 5e-7;
 constexpr double refined = 1e-5;
 // Rounds of refinement: without pairs a round takes two digits, with pairs that stick less than
 // one.
-constexpr int rounds_max = 30, rounds_with_pairs_max = 120;
+constexpr int rounds_max = 30, rounds_with_pairs_max = 60;
 // Relative tolerance of GMRES in a round: less would be lost on the matrix, which is not exact.
 constexpr double round_tolerance = 3e-3;
 
@@ -270,8 +270,8 @@ void Sensitivities::subtract_corrections(const ClothMatrix& matrix) {
   }
 }
 
-// Solves for the change that the right-hand side asks for, and takes it. Returns its size over that
-// of d.
+// Solves for the update that the right-hand side asks for, and takes the best mix of it and those
+// before. Returns its size over that of d.
 double Sensitivities::refine(const Step& step) {
   const int components = 4 * assembly_.numbering.free_nodes;
   const Factor& factor = factor_for(step);
@@ -286,13 +286,12 @@ double Sensitivities::refine(const Step& step) {
                                             work_.data(), round_tolerance);
   double change = 0.0, size = 0.0;
   for (int k = 0; k < components; ++k) {
-    const double component = static_cast<double>(solution_[k]) + correction_[k];
-    solution_[k] = static_cast<float>(component);
-    derivative_[k] += component;
-    change = std::max(change, std::abs(component));
-    size = std::max(size, std::abs(derivative_[k]));
+    solution_[k] += correction_[k];
+    change = std::max(change, std::abs(static_cast<double>(solution_[k])));
   }
-  update_pair_forces();
+  find_pair_updates();
+  take_update();
+  for (int k = 0; k < components; ++k) size = std::max(size, std::abs(derivative_[k]));
   return size > 0.0 ? change / size : 0.0;
 }
 
@@ -303,6 +302,7 @@ void Sensitivities::solve(int parameter, const Step& step) {
   for (PairContact& contact : pairs_) contact.change.setZero();
   const int rounds = pairs_.empty() ? rounds_max : rounds_with_pairs_max;
   double change = 0.0;
+  acceleration_.restart();
   for (int round = 0; round < rounds; ++round) {
     linearize(parameter, step);
     change = refine(step);

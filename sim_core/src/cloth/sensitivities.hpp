@@ -26,6 +26,7 @@
 #include <memory>
 #include <vector>
 
+#include "cloth/acceleration.hpp"
 #include "cloth/newton.hpp"
 #include "cloth/velocities.hpp"
 
@@ -164,6 +165,7 @@ class Sensitivities {
     double turning = 0.0, softening = 1.0, distance = 0.0;
     double event = 0.0;                                    // as of a node
     Eigen::Vector3d change = Eigen::Vector3d::Zero();      // of the force, N per unit
+    Eigen::Vector3d update = Eigen::Vector3d::Zero();      // of that, by a round
     Eigen::Vector3d right_side = Eigen::Vector3d::Zero();  // N per unit
   };
 
@@ -197,7 +199,8 @@ class Sensitivities {
   const Factor& factor_for(const Step& step);
   void subtract_corrections(const ClothMatrix& matrix);
   double refine(const Step& step);
-  void update_pair_forces();
+  void find_pair_updates();
+  void take_update();
   double nearest_event_of_contacts() const;
   void update_history(State& state, const Step& step);
   Eigen::Vector3d origin_of(const State& state, int node, const Step& step) const;
@@ -223,6 +226,7 @@ class Sensitivities {
   Buffer<float> normal_, direction_, coupling_, turning_, force_, correction_, solution_, image_,
       work_;
   Buffer<double> derivative_;  // d
+  Acceleration acceleration_;
   Buffer<double> by_parameter_, by_term_, stiffness_change_, pulled_, plus_, minus_, at_, at_start_;
   const DriveRates no_rates_;
   int bodies_ = 0;  // in the step at hand

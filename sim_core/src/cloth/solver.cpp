@@ -193,6 +193,8 @@ StepReport ClothSolver::advance(double& time, double event, const PrescribedMoti
 
 Eigen::Vector3d ClothSolver::momentum_rate() const { return impl_->stepper.momentum_rate(); }
 
+Eigen::Vector3d ClothSolver::damping_force() const { return impl_->stepper.damping_force(); }
+
 Points3 ClothSolver::positions() const { return impl_->unload(impl_->stepper.x); }
 Points3 ClothSolver::velocities() const { return impl_->unload(impl_->stepper.velocities.at_end); }
 Points3 ClothSolver::reactions() const { return impl_->unload(impl_->newton.residual); }

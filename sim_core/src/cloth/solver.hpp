@@ -91,6 +91,8 @@ class ClothSolver {
   StepReport advance(double& time, double event, const PrescribedMotion& motion, bool may_fail);
   // Rate of the cloth's momentum in the last step, N: the sum of all forces.
   Eigen::Vector3d momentum_rate() const;
+  // Force of damping in the last step, N.
+  Eigen::Vector3d damping_force() const;
 
   Points3 positions() const;
   Points3 velocities() const;

@@ -263,6 +263,18 @@ class TestBalances:
         along = np.linalg.norm(pushed[touching][:, :2], axis=1)
         assert (along <= 0.4 * pushed[touching][:, 2] + 2e-3 * cloth.force_scale).all()
 
+    @pytest.mark.parametrize("second_order", [False, True])
+    def test_damping_is_no_force_of_contact(self, second_order: bool) -> None:
+        """Neither that of the fabric nor that of the scene, in a fall that nothing touches."""
+        damped = replace(MATERIAL, damping=2.0)
+        cloth = Cloth(PATCH, damped, replace(CERTIFIED, second_order=second_order))
+        cloth.set_state(np.column_stack([PATCH.rest, np.full(len(PATCH.rest), 1.0)]))
+        for _ in range(10):
+            cloth.step(0.02, bodies=[plane(0.4)], damping=1.0)
+        weight = cloth.masses.sum() * GRAVITY
+        assert cloth.momentum_rate[2] > -0.7 * weight
+        assert np.abs(cloth.contact_force()).max() < 1e-6 * weight
+
     @pytest.mark.parametrize("mesh", [PATCH, SCATTERED], ids=["grid", "unstructured"])
     def test_free_fall_is_exact(self, mesh: Mesh) -> None:
         """After t it has fallen by g t^2/2, whatever the lengths of the steps."""

@@ -26,7 +26,9 @@ from stickslip_sim_core.cloth.sensitivities import (
 )
 from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
 
-TIGHT = replace(preset_named("certified"), tolerance=1e-9)
+# Of second order a run jumps where a vertex lands or leaves, by up to half a millimetre in steps of
+# 10 ms: another scheme takes it there.
+TIGHT = replace(preset_named("certified"), tolerance=1e-9, second_order=False)
 SLOPE = np.deg2rad(25.0)
 STEP = 0.01
 TURNED = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])

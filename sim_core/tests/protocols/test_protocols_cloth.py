@@ -123,21 +123,21 @@ class TestLateralBuckling:
 class TestLimits:
     def test_of_a_power(self) -> None:
         sizes = ((0.1,), (0.06,), (0.03,))
-        found = Refinement.of(
+        refinement = Refinement.of(
             ((10.0,), (17.0,), (33.0,)), sizes, tuple((3.0 + 2.0 * h**1.7,) for (h,) in sizes)
         )
-        assert found.limit[0] == pytest.approx(3.0)
-        assert found.order[0] == pytest.approx(1.7)
+        assert refinement.limit[0] == pytest.approx(3.0)
+        assert refinement.order[0] == pytest.approx(1.7)
 
     def test_without_an_order(self) -> None:
         """Values that go to and fro: the order is that of theory, and the certificate gives the one
         of theory.
         """
-        found = Refinement.of(
+        refinement = Refinement.of(
             ((10.0,), (20.0,), (40.0,)), ((0.4,), (0.2,), (0.1,)), ((1.0,), (1.3,), (1.2,))
         )
-        assert math.isnan(found.order[0])
-        assert found.limit[0] == pytest.approx(1.2 - 0.1 / 3.0)
+        assert math.isnan(refinement.order[0])
+        assert refinement.limit[0] == pytest.approx(1.2 - 0.1 / 3.0)
 
     def test_a_wrong_limit_fails(self) -> None:
         refinement = Refinement(((1.0,),) * 3, ((1.0,),) * 3, (1.002,), (2.0,))
@@ -200,12 +200,11 @@ class TestMotion:
         assert not protocols.run(name).passed
 
     @pytest.mark.parametrize("preset", ["fast", "certified", "fine"])
-    def test_a_swing_of_second_order_passes(self, preset: str) -> None:
-        settings = replace(PRESETS[preset], second_order=True)
-        assert oscillation.Swing(preset=settings).run().passed
+    def test_a_swing_passes(self, preset: str) -> None:
+        assert protocols.run("swing", preset).passed
 
     def test_the_swing_fails_where_the_scheme_damps_it(self) -> None:
-        result = oscillation.Swing(preset=CERTIFIED).run()
+        result = oscillation.Swing(preset=replace(CERTIFIED, second_order=False)).run()
         assert not result.passed
         assert result.error > 0.1
 
@@ -243,10 +242,10 @@ class TestPresets:
             "heavy-fold",
             "stacked-incline",
             "pull-out",
+            "swing",
         }
         expected = always if preset.startswith("thesis-") else always | of_scenes
-        swings = {"swing"} if preset == "fine" else set()
-        assert set(certification.protocols) == expected | swings
+        assert set(certification.protocols) == expected
         assert certification.numbers()["time_step"] == PRESETS[preset].time_step
 
     @pytest.mark.parametrize(

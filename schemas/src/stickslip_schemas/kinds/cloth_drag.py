@@ -17,6 +17,7 @@ from stickslip_schemas.kinds.cloth.arrays import (
     solver_arrays,
 )
 from stickslip_schemas.kinds.cloth.fabric_axes import with_drawn_material
+from stickslip_schemas.kinds.cloth.sensitivities import derivative_arrays, with_derivatives
 from stickslip_schemas.kinds.cloth.spec import (
     VIEWPOINT,
     ClipRender,
@@ -134,6 +135,9 @@ class ClothDragAxes(Document):
     )
 
 
+DIFFERENTIABLE = ("mu", "density", "bending", "stretching")
+"""The axes by which runs may be differentiated. They need no axis in the spec."""
+
 PHYSICAL_AXES = ("material", "mu", "static_ratio", "density", "bending", "stretching")
 """The axes that a trajectory depends on."""
 
@@ -157,6 +161,7 @@ class ClothDragSimulation(Simulation):
     frames: int
     seed: Seed
     self_friction: float | None = Field(description="null: the cloth passes through itself")
+    sensitivities: tuple[str, ...] = Field(default=(), exclude_if=lambda names: not names)
 
     @property
     def vertices(self) -> int:
@@ -290,11 +295,26 @@ class ClothDragSpec(ClipSpec):
         card = self.materials.get(point["material"])
         fabric = point["material"] if card is None else card.size_words
         group = f"{fabric}, mu {point['mu']:.1g}, mesh {self.mesh}, {self.preset}"
-        return group if self.self_friction is None else f"{group}, self-contact"
+        if self.self_friction is not None:
+            group = f"{group}, self-contact"
+        return with_derivatives(group, self)
 
     def simulation_settings(self) -> dict[str, Any]:
         settings = {"preset": self.preset, "mesh": self.mesh, "frames": self.instants}
-        return settings | {"self_friction": self.self_friction}
+        return settings | {
+            "self_friction": self.self_friction,
+            "sensitivities": self.sensitivities,
+        }
+
+    @property
+    def differentiable_parameters(self) -> tuple[str, ...]:
+        return DIFFERENTIABLE
+
+    def why_not_differentiable(self, name: str) -> str:
+        return "is a name" if name == "material" else ""
+
+    def parameter_unit(self, name: str) -> str:
+        return "1"
 
     def render_settings(self) -> dict[str, Any] | None:
         return (super().render_settings() or {}) | {"rig": RIG, "rig_digest": rig_digest(RIG)}
@@ -369,16 +389,17 @@ def _mesh(spec: ClothDragSpec) -> tuple[ArrayLayout, ...]:
     # A square of mesh x mesh vertices has two triangles in each cell.
     vertex = {"vertex": spec.mesh**2}
     corners = {"triangle": 2 * (spec.mesh - 1) ** 2, "corner": 3}
-    positions = "positions of the vertices [m]; the floor is z = 0"
+    positions = over_time(
+        spec,
+        "positions",
+        "positions of the vertices [m]; the floor is z = 0",
+        of=vertex | {"xyz": 3},
+        per_sample=True,
+        is_trajectory=True,
+    )
     return (
-        over_time(
-            spec,
-            "positions",
-            positions,
-            of=vertex | {"xyz": 3},
-            per_sample=True,
-            is_trajectory=True,
-        ),
+        positions,
+        *derivative_arrays(spec, {"": positions}),
         array(
             "rest",
             "the flat cloth (warp, weft) [m]",

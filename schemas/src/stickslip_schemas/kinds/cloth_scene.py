@@ -6,20 +6,15 @@ from itertools import combinations, product
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
-    BeforeValidator,
-    ConfigDict,
     Field,
-    GetJsonSchemaHandler,
     JsonValue,
     ValidationError,
     ValidationInfo,
     field_validator,
     model_validator,
 )
-from pydantic.json_schema import JsonSchemaValue
-from pydantic_core import CoreSchema
 
-from stickslip_schemas.base import Document, Sha256, Stage, artifact_digest
+from stickslip_schemas.base import Sha256, Stage, artifact_digest
 from stickslip_schemas.kinds.cloth import fabric_axes
 from stickslip_schemas.kinds.cloth.arrays import (
     clip_arrays,
@@ -28,21 +23,19 @@ from stickslip_schemas.kinds.cloth.arrays import (
     scene_segments,
     solver_arrays,
 )
-from stickslip_schemas.kinds.cloth.spec import (
-    VIEWPOINT,
-    ClipRender,
-    ClipSpec,
-    LampAxis,
-    SubstrateAxis,
-    TextureAxis,
+from stickslip_schemas.kinds.cloth.scene_axes import BuiltIn, ClothSceneAxes
+from stickslip_schemas.kinds.cloth.sensitivities import (
+    Differentiated,
+    differentiated,
+    why_not_differentiable,
+    with_derivatives,
 )
+from stickslip_schemas.kinds.cloth.spec import ClipRender, ClipSpec
 from stickslip_schemas.scene.document import Physics, Scene, Staged
 from stickslip_schemas.scene.library import load_scene
 from stickslip_schemas.scene.parameters import (
     LOOKS_AXES,
     Location,
-    ParameterName,
-    Value,
     refuse,
     refuse_as,
     resolve_path,
@@ -50,64 +43,13 @@ from stickslip_schemas.scene.parameters import (
 )
 from stickslip_schemas.scene.parts import MeshBody
 from stickslip_schemas.spec.arrays import ArrayLayout
-from stickslip_schemas.spec.axes import (
-    SHORTHAND,
-    TAGGED,
-    AnyAxis,
-    LinspaceAxis,
-    ListAxis,
-    RandomAxis,
-    Seed,
-    SobolAxis,
-    extremes,
-    quantity,
-)
+from stickslip_schemas.spec.axes import AnyAxis, ListAxis, Seed, extremes
 from stickslip_schemas.spec.cameras import FRAMING, Camera, load_rig, rig_cameras, rig_digest
 from stickslip_schemas.spec.jobs import CONTACT_PROTOCOLS, Costs, SeedRule, Simulation, StartFault
-from stickslip_schemas.spec.names import CustomName, FloorNumbers, LampNumbers, did_you_mean
+from stickslip_schemas.spec.names import FloorNumbers, LampNumbers, did_you_mean
 
 OF_SCENE = "scene"
 """Name of the light and the floor that the scene gives as numbers."""
-
-Number = Annotated[float, quantity("Number"), Field(strict=True)]
-Choice = Annotated[Value, quantity("Value")]
-ParameterAxis = Annotated[
-    ListAxis[Choice] | LinspaceAxis[Number] | RandomAxis[Number] | SobolAxis[Number],
-    TAGGED,
-    SHORTHAND,
-]
-
-
-class _BuiltIn(BeforeValidator):
-    """Accepts the name of a built-in scene, in validation and in the JSON schema."""
-
-    def __get_pydantic_json_schema__(
-        self, core: CoreSchema, handler: GetJsonSchemaHandler
-    ) -> JsonSchemaValue:
-        document = handler(core)
-        # A scene is always written out whole.
-        if handler.mode == "serialization":
-            return document
-        name = {"type": "string", "description": "the name of a built-in scene"}
-        return {"anyOf": [name, document]}
-
-
-class ClothSceneAxes(Document):
-    """Axes of a clip of a scene: any parameter of the scene, by its name, and looks."""
-
-    # The names of parameters are known only with the scene, so they are extra fields here.
-    model_config = ConfigDict(extra="allow")
-    __pydantic_extra__: dict[ParameterName, ParameterAxis]
-
-    texture: TextureAxis
-    viewpoint: Annotated[ListAxis[Annotated[CustomName, quantity("Camera")]], SHORTHAND, VIEWPOINT]
-    lighting: LampAxis = None
-    substrate: SubstrateAxis | None = Field(
-        default=None,
-        description=(
-            "finish of the floor, or a custom one under `substrates`; by default the scene's"
-        ),
-    )
 
 
 class ClothSceneSimulation(Simulation):
@@ -116,6 +58,11 @@ class ClothSceneSimulation(Simulation):
     kind: Literal["cloth_scene"] = "cloth_scene"
     scene: Physics
     seed: Seed
+    sensitivities: dict[str, Differentiated] = Field(
+        default_factory=dict,
+        exclude_if=lambda by_name: not by_name,
+        description="what the run is differentiated by, by name",
+    )
 
     @property
     def artifacts(self) -> tuple[Sha256, ...]:
@@ -135,7 +82,8 @@ class ClothSceneSimulation(Simulation):
 
         scene = with_arrays(self.scene, read)
         check_start(scene)
-        return {"scene": scene, "seed": self.seed}
+        by_name = {name: by.model_dump(mode="json") for name, by in self.sensitivities.items()}
+        return {"scene": scene, "seed": self.seed, "sensitivities": by_name}
 
 
 class ClothSceneRender(ClipRender):
@@ -183,7 +131,7 @@ class ClothSceneSpec(ClipSpec):
 
     kind: Literal["cloth_scene"]
     scene: Annotated[
-        Scene, _BuiltIn(lambda scene: load_scene(scene) if isinstance(scene, str) else scene)
+        Scene, BuiltIn(lambda scene: load_scene(scene) if isinstance(scene, str) else scene)
     ] = Field(description="the name of a built-in scene, or the document of a scene")
     set: dict[str, JsonValue] = Field(
         default_factory=dict,
@@ -338,7 +286,25 @@ class ClothSceneSpec(ClipSpec):
         return tuple(axis for axis in self.named_axes if axis not in left_out)
 
     def simulation_settings(self) -> dict[str, Any]:
-        return {"scene": self.stage.with_slots(self.stage.physics())}
+        return {
+            "scene": self.stage.with_slots(self.stage.physics()),
+            "sensitivities": {
+                name: differentiated(self.stage, name) for name in self.sensitivities
+            },
+        }
+
+    @cached_property
+    def differentiable_parameters(self) -> tuple[str, ...]:
+        known = self.stage.parameters
+        return tuple(name for name in known if not self.why_not_differentiable(name))
+
+    def why_not_differentiable(self, name: str) -> str:
+        if name not in self.stage.parameters:
+            return ""
+        return why_not_differentiable(self.stage, name)
+
+    def parameter_unit(self, name: str) -> str:
+        return self.stage.parameters[name].unit
 
     def render_settings(self) -> dict[str, Any] | None:
         looks = self.stage.looks
@@ -445,7 +411,7 @@ class ClothSceneSpec(ClipSpec):
             return f"{super().cost_group(stage, point)}, {self._cost_of_scene}"
         names = self._parameter_fields
         words = (fabric_axes.cost_words(self.stage, point.get(name)) for name in names)
-        return ", ".join((self._cost_of_scene, *words))
+        return with_derivatives(", ".join((self._cost_of_scene, *words)), self)
 
     def arrays(self) -> tuple[ArrayLayout, ...]:
         # With zipped axes, a parameter without an axis has no label.

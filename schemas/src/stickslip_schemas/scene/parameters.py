@@ -134,6 +134,12 @@ class Parameter(Document):
         return [(location, value) for location, value in locations if value is not None]
 
     @property
+    def bounds(self) -> tuple[float, float]:
+        """Least and largest number that it may be; not for names."""
+        numbers = [value for _, value in self.extremes if isinstance(value, float)]
+        return min(numbers), max(numbers)
+
+    @property
     def range(self) -> str:
         """The allowed values, in words."""
         # A pure number has no unit to show.

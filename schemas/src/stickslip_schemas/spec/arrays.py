@@ -28,6 +28,9 @@ REGIONS = {
 }
 """Regions in which the quality of a clip is measured."""
 
+DERIVATIVE_BY = "derivative_by"
+"""Attribute of an array of derivatives: the name of the parameter."""
+
 NAN = float("nan")
 
 

@@ -1,14 +1,15 @@
 """Commands for scenes: check, preview and simulate one."""
 
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
 from click.exceptions import Exit
-from pydantic import JsonValue
-from stickslip_schemas.documents.problems import FieldError
+from pydantic import JsonValue, ValidationError
+from stickslip_schemas.documents.problems import FieldError, field_errors
 from stickslip_schemas.format.manifest import layout
 from stickslip_schemas.kinds.cloth_scene import ClothSceneSpec
 from stickslip_schemas.scene.document import Scene
@@ -49,6 +50,13 @@ scene_argument = click.argument(
     help="simulate even where no certificate vouches for the preset",
 )
 @click.option("--obj", is_flag=True, help="write an OBJ file for each sheet and frame, too")
+@click.option(
+    "--sensitivities",
+    metavar="NAMES",
+    default="",
+    show_default=False,
+    help="differentiate the positions by these parameters of the scene, for example mu,speed",
+)
 @json_option
 @shows_errors
 @reading_files_once()
@@ -58,6 +66,7 @@ def simulate(
     certificate_folder: Path | None,
     allow_uncertified: bool,
     obj: bool,
+    sensitivities: str,
     as_json: bool,
 ) -> None:
     """Simulate one sample of a scene on this machine, with its default parameters.
@@ -73,7 +82,8 @@ def simulate(
     certificate = None
     if certificate_folder is not None:
         certificate = making.read_certificate(certificate_folder)
-    spec = spec_of(document, allow_uncertified=allow_uncertified)
+    names = [name.strip() for name in sensitivities.split(",")] if sensitivities else []
+    spec = spec_of(document, allow_uncertified=allow_uncertified, sensitivities=names)
     refuse_impossible_start(scene, spec, files)
     result = making.simulate(spec, files, out, certificate=certificate, obj=obj)
     if as_json:
@@ -83,7 +93,19 @@ def simulate(
         say("certified" if result["certified"] else f"NOT certified: {result['why_not_certified']}")
         if not result["valid"]:
             say(f"NOT valid: {result['reason']}")
+        for line in _derivative_lines(spec, result["labels"]):
+            say(line)
     raise Exit(0 if result["valid"] else 1)
+
+
+def _derivative_lines(spec: ClothSceneSpec, labels: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a line for each derivative of a run, as far as it ran."""
+    for name in spec.sensitivities if labels else ():
+        largest = labels[f"largest_by_{name}"]
+        unit = f"m per {spec.parameter_unit(name)}"
+        size = f"at most {largest:.3g} {unit}" if largest else "0: it has no effect here"
+        is_solved = math.isfinite(largest)
+        yield f"derivative by {name}: {size if is_solved else 'NOT solved in some step'}"
 
 
 @click.group(cls=CommandGroup)
@@ -214,8 +236,13 @@ def refuse_impossible_start(name: str, spec: ClothSceneSpec, files: Mapping[str,
     raise CommandError("\n".join(lines))
 
 
-def spec_of(scene: Scene, *, allow_uncertified: bool = True) -> ClothSceneSpec:
-    """Return the spec of one sample of a scene: default parameters, seen by its first camera."""
+def spec_of(
+    scene: Scene, *, allow_uncertified: bool = True, sensitivities: Sequence[str] = ()
+) -> ClothSceneSpec:
+    """Return the spec of one sample of a scene: default parameters, seen by its first camera.
+
+    Raises CommandError if its runs cannot be differentiated by `sensitivities`.
+    """
     # One camera suffices: the simulation does not depend on it.
     cameras = scene.looks.cameras
     if isinstance(cameras, dict):
@@ -224,12 +251,17 @@ def spec_of(scene: Scene, *, allow_uncertified: bool = True) -> ClothSceneSpec:
         viewpoints = [camera.name for camera in load_rig(cameras)]
     else:
         viewpoints = list(FRAMING)
-    return ClothSceneSpec.model_validate(
-        {
-            "kind": "cloth_scene",
-            "scene": scene.model_dump(mode="json"),
-            "frames": min(SAMPLE_FRAMES, scene.frames),
-            "allow_uncertified": allow_uncertified,
-            "axes": {"texture": "checker", "viewpoint": viewpoints[0]},
-        }
-    )
+    document = {
+        "kind": "cloth_scene",
+        "scene": scene.model_dump(mode="json"),
+        "frames": min(SAMPLE_FRAMES, scene.frames),
+        "allow_uncertified": allow_uncertified,
+        "sensitivities": list(sensitivities),
+        "axes": {"texture": "checker", "viewpoint": viewpoints[0]},
+    }
+    try:
+        return ClothSceneSpec.model_validate(document)
+    except ValidationError as error:
+        # The scene itself has been checked, so the fault is in what the command adds.
+        lines = [field_line(field) for field in field_errors(error, document, ClothSceneSpec)]
+        raise CommandError("\n".join(["the scene cannot be run so", *lines])) from error

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from stickslip_schemas.scene.shapes import with_roundings
 from stickslip_schemas.scene.sheets import start_of
-from stickslip_schemas.spec.arrays import ArrayLayout
+from stickslip_schemas.spec.arrays import DERIVATIVE_BY, ArrayLayout
 
 from stickslip_services.pages.samples import SampleData
 
@@ -37,7 +37,8 @@ Body = dict[str, Any]
 
 def is_path(array: ArrayLayout) -> bool:
     """Return whether an array holds points in space: of a rod, a cloth, or a sheet of a scene."""
-    if len(array.shape) not in (2, 3) or array.dimensions[-1] != "xyz":
+    is_derivative = DERIVATIVE_BY in array.attributes
+    if is_derivative or len(array.shape) not in (2, 3) or array.dimensions[-1] != "xyz":
         return False
     # A scene has `towel.vertex`, for example.
     return array.dimensions[-2].split(".")[-1] in ("point", "vertex")

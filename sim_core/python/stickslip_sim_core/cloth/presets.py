@@ -117,8 +117,10 @@ PRESETS: Mapping[str, SolverSettings] = MappingProxyType(
     {
         settings.name: settings
         for settings in (
-            SolverSettings("certified", 0.02),
-            SolverSettings("fast", 0.04, tolerance=2e-4, step_error=4e-4, finest=16),
+            SolverSettings("certified", 0.02, second_order=True),
+            SolverSettings(
+                "fast", 0.04, tolerance=2e-4, step_error=4e-4, finest=16, second_order=True
+            ),
             # For comparisons of frames.
             SolverSettings(
                 "fine",

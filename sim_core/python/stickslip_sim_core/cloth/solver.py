@@ -579,24 +579,25 @@ class Cloth:
     def momentum_rate(self) -> Floats:
         """Rate of the cloth's momentum in the last step (3,) [N]: the sum of all forces.
 
-        The change of `masses @ velocities` over a step is not this rate times its length: the step
-        changes the velocity at the middle of the step before to that at its own middle. It is zero
-        before the first step.
+        It is the rate by which the scheme of each vertex balances forces. The change of
+        `masses @ velocities` over a step is not this rate times its length: velocities belong to
+        the middles of steps, or change over two steps. It is zero before the first step.
         """
         return np.asarray(self._solver.momentum_rate())
 
     def contact_force(self) -> Floats:
         """Return the force of bodies and surfaces on the cloth in the last step (3,) [N].
 
-        It is the rate of momentum, minus the weight and the force of the holders. It is zero before
-        the first step.
+        It is the rate of momentum, minus the weight, the force of the holders and that of damping.
+        It is zero before the first step.
         """
         # The force comes from the balance of momentum, so it does not rely on the friction law.
         if not self.total.steps:
             return np.zeros(3)
         holders = self.reactions[self.held].sum(axis=0)
         weight = (self.masses[:, None] * self.gravity).sum(axis=0)
-        return np.asarray(self.momentum_rate - weight - holders)
+        damping = self._solver.damping_force()
+        return np.asarray(self.momentum_rate - weight - holders - damping)
 
     def softest(self) -> float:
         """Return the smallest eigenvalue of stiffness over mass in this state [1/s^2].

@@ -140,6 +140,7 @@ _CLOTH = (
 )
 SCENE_PROTOCOLS = (
     *_CLOTH,
+    "swing",
     "shaken-floor",
     "capstan",
     "edge",
@@ -154,9 +155,6 @@ def _of_cloth(preset: SolverSettings) -> Certification:
     # The thesis's steps of 0.5 ms would take hours on the protocols of contact.
     touches = not preset.name.startswith("thesis-")
     names = SCENE_PROTOCOLS if touches else _CLOTH
-    # First order damps a swing by its nature, and no step of scenes is short enough to hide it.
-    if preset.second_order:
-        names = (*names, "swing")
     return Certification(names, "stickslip_sim_core.cloth", preset.numbers)
 
 

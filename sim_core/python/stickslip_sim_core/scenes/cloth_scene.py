@@ -488,7 +488,7 @@ def _simulated(scene_and_seed: Mapping[str, Any], on_frame: OnFrame | None) -> O
     error is a bug, and the caller gets it.
     """
     asked = scene_and_seed.get("sensitivities", {})
-    parameters = {name: FamilyParameter(*places) for name, places in asked.items()}
+    parameters = {name: FamilyParameter(**places) for name, places in asked.items()}
     try:
         scenes = family(scene_and_seed["scene"], parameters, seed=scene_and_seed["seed"])
         simulated_scene = scenes.differentiated(tuple(parameters))

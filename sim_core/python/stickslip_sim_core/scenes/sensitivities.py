@@ -19,6 +19,9 @@ from stickslip_sim_core.scenes.frames import Frame
 from stickslip_sim_core.scenes.holders import Hands, Holder
 from stickslip_sim_core.scenes.kind import Record
 
+UNSOLVED = 1e-2
+"""Relative change in the last round of solving a step from which on derivatives are lost."""
+
 ONE_SIDED = 1e-4
 """Change of a parameter, over its size, within which an event makes a frame one-sided."""
 
@@ -82,7 +85,10 @@ class Sensitivity:
     """The derivative of a run by a parameter, at each frame."""
 
     positions: Floats
-    """Of positions: (frames, V, 3) [m per unit]."""
+    """Of positions: (frames, V, 3) [m per unit].
+
+    They are NaN from a step on whose derivatives could not be solved.
+    """
 
     nearest_event: Floats
     """How far the parameter may change until a contact changes its branch: (frames,).
@@ -103,7 +109,7 @@ class Sensitivity:
         return bool(self.positions.any())
 
 
-class _AtFrame(NamedTuple):
+class AtFrame(NamedTuple):
     """Derivatives at one frame, by each parameter."""
 
     positions: Floats
@@ -170,14 +176,17 @@ class Followed:
         report = self._cloth.sensitivity_report
         self._unrefined, self._change = report.unrefined, max(self._change, report.change)
 
-    def at_frame(self, frame: Frame) -> _AtFrame:
+    def at_frame(self, frame: Frame) -> AtFrame:
         """Return the derivatives at a frame in the last step."""
         nearest = self._nearest
         self._nearest = np.full(len(self._by), np.inf)
         positions = self._cloth.sensitivities_at(frame.time, straight=frame.straight)
-        return _AtFrame(positions, nearest)
+        # All later derivatives are made from those of the step that was not solved.
+        if not self._change < UNSOLVED:
+            positions = np.full_like(positions, np.nan)
+        return AtFrame(positions, nearest)
 
-    def over_frames(self, frames: Sequence[_AtFrame]) -> dict[str, Sensitivity]:
+    def over_frames(self, frames: Sequence[AtFrame]) -> dict[str, Sensitivity]:
         """Return the derivatives at all frames, by the names of parameters."""
         over = {}
         for number, by in enumerate(self._by):
@@ -189,11 +198,11 @@ class Followed:
             )
         return over
 
-    def labels(self, frames: Sequence[_AtFrame]) -> dict[str, Any]:
+    def labels(self, frames: Sequence[AtFrame]) -> dict[str, Any]:
         """Return how well derivatives were solved, and how large each is.
 
         `largest_by_NAME` is the largest derivative of a coordinate [m per unit]. It is 0 if the
-        parameter has no effect.
+        parameter has no effect, and NaN if derivatives could not be solved.
         """
         if not self._by:
             return {}

@@ -167,14 +167,14 @@ def _check_marks(
     task = cloth_task(record, texture="marks", image=marks, textures=[marks, white], **settings)
     clips = output_of(actor, task).clips
     frames = [_frame(store, clips[name].output, size) for name in (marks, white)]
-    shown, lit = (decoded(frame).astype(float).sum(axis=2) for frame in frames)
+    level, lit = (decoded(frame).astype(float).sum(axis=2) for frame in frames)
 
-    rows, columns = np.indices(shown.shape)
+    rows, columns = np.indices(level.shape)
     for mark in MARKS:
         expected = _middle_of_mark(seen_by, mark)
         reach = 1.35 * RADIUS * SIDE * seen_by.fx / seen_by.project(np.zeros((1, 3)))[1][0]
         near = np.hypot(columns - expected[0], rows - expected[1]) < reach
-        share = shown[near] / lit[near]
+        share = level[near] / lit[near]
         share = (share - share.min()) / (np.median(share[share > 0.5]) - share.min())
         # Within the mark and beside it, only noise and light from other cloth differ from 1 and 0.
         share = np.where(share > 1.0 - PLAIN, 1.0, np.where(share < PLAIN, 0.0, share))

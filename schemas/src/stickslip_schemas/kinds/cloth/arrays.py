@@ -5,6 +5,7 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
+from stickslip_schemas.kinds.cloth.sensitivities import derivative_arrays
 from stickslip_schemas.kinds.cloth.spec import ClipSpec, GroundTruth
 from stickslip_schemas.scene.document import Scene
 from stickslip_schemas.spec.arrays import REGIONS, ArrayLayout, array
@@ -233,6 +234,8 @@ def scene_arrays(spec: ClipSpec, scene: Scene) -> tuple[ArrayLayout, ...]:
     if spec.store_positions:
         for name in scene.sheets:
             meshes += _mesh(spec, scene, name)
+        positions = {f"{name}.": _positions(spec, scene, name) for name in scene.sheets}
+        meshes += derivative_arrays(spec, positions)
     labels: list[ArrayLayout] = []
     for name, sheet in scene.sheets.items():
         labels += fabric_arrays(f"{name}.")
@@ -318,21 +321,26 @@ def _tracks(spec: ClipSpec, scene: Scene) -> Iterator[ArrayLayout]:
         )
 
 
+def _positions(spec: ClipSpec, scene: Scene, sheet: str) -> ArrayLayout:
+    vertices, _ = scene.sheets[sheet].mesh.shape
+    # Dimensions have the name of the sheet: sheets have different numbers of vertices.
+    return over_time(
+        spec,
+        f"{sheet}.positions",
+        "positions of the vertices [m]",
+        of={f"{sheet}.vertex": vertices, "xyz": 3},
+        per_sample=True,
+        is_trajectory=True,
+    )
+
+
 def _mesh(spec: ClipSpec, scene: Scene, sheet: str) -> tuple[ArrayLayout, ...]:
     """Return the mesh of a sheet, its motion and its contact."""
     vertices, triangles = scene.sheets[sheet].mesh.shape
-    # Dimensions have the name of the sheet: sheets have different numbers of vertices.
     by_vertex = {f"{sheet}.vertex": vertices}
     by_corner = {f"{sheet}.triangle": triangles, "corner": 3}
     return (
-        over_time(
-            spec,
-            f"{sheet}.positions",
-            "positions of the vertices [m]",
-            of={**by_vertex, "xyz": 3},
-            per_sample=True,
-            is_trajectory=True,
-        ),
+        _positions(spec, scene, sheet),
         over_time(
             spec,
             f"{sheet}.contact",

@@ -18,6 +18,8 @@ from stickslip_schemas.base import (
     Stage,
     artifact_digest,
 )
+from stickslip_schemas.kinds.cloth import sensitivities
+from stickslip_schemas.scene.parameters import ParameterName, refuse
 from stickslip_schemas.scene.parts import View
 from stickslip_schemas.spec.arrays import shown_frames
 from stickslip_schemas.spec.axes import SHORTHAND, ListAxis, Seed, axis_values, quantity
@@ -259,6 +261,7 @@ class ClipSpec(JobSpec):
             "640 x 480 takes 5 times as much as the default, 1,280 x 720 takes 11 times"
         },
     )
+    sensitivities: tuple[ParameterName, ...] = sensitivities.names_field()
     creases: Float = Field(
         default=0.0,
         ge=0,
@@ -303,7 +306,7 @@ class ClipSpec(JobSpec):
         render = 0.01 * self.frames * enlargement
         render += measured_frames * MEASURED_FRAME_COST * groups * reference
         return Costs(
-            simulate,
+            simulate * (1.0 + sensitivities.COST * len(self.sensitivities)),
             render,
             self.frames * frame,
             pack=0.02 * area,
@@ -443,6 +446,35 @@ class ClipSpec(JobSpec):
             raise ValueError(
                 f"ground_truth must name each array once; got {', '.join(self.ground_truth)}"
             )
+        return self
+
+    def parameter_unit(self, name: str) -> str:
+        """Return the unit of a parameter that runs may be differentiated by."""
+        raise NotImplementedError
+
+    def why_not_differentiable(self, name: str) -> str:
+        """Return why runs cannot be differentiated by a parameter, or an empty text."""
+        raise NotImplementedError
+
+    @property
+    def differentiable_parameters(self) -> tuple[str, ...]:
+        """Names of the parameters that runs may be differentiated by."""
+        raise NotImplementedError
+
+    @model_validator(mode="after")
+    def _can_be_differentiated(self) -> Self:
+        known = self.differentiable_parameters
+        for position, name in enumerate(self.sensitivities):
+            location = ("sensitivities", position)
+            if name not in known:
+                reason = self.why_not_differentiable(name)
+                rule = f"must be one of {', '.join(known) or 'none'}{did_you_mean(name, known)}"
+                refuse(self, location, f"{rule}; {name} {reason}" if reason else rule, name)
+            if name in self.sensitivities[:position]:
+                refuse(self, location, "must be named once", name)
+        if self.sensitivities and not self.store_positions:
+            rule = "must be empty if store_positions is false: they are derivatives of positions"
+            refuse(self, ("sensitivities",), rule, list(self.sensitivities))
         return self
 
     @model_validator(mode="after")
