@@ -140,7 +140,7 @@ def test_limit_and_order() -> None:
 
 def test_there_are_twelve_experiments_with_three_resolutions() -> None:
     assert len(experiments.EXPERIMENTS) == 12
-    assert {len(one.cells) for one in experiments.EXPERIMENTS.values()} == {3}
+    assert {len(experiment.cells) for experiment in experiments.EXPERIMENTS.values()} == {3}
 
 
 @pytest.mark.parametrize(
