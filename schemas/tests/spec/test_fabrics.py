@@ -12,7 +12,7 @@ from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
 from stickslip_schemas.kinds.cloth_scene import ClothSceneSimulation, ClothSceneSpec
 from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.plan.points import keyed_points
-from stickslip_schemas.spec import fabrics
+from stickslip_schemas.spec import fabrics, measured
 from stickslip_schemas.spec.fabrics import FabricNumbers
 from stickslip_schemas.spec.reality import measured_fabrics
 
@@ -110,16 +110,16 @@ def test_drawn_fabrics_have_the_statistics_of_the_measured_ones() -> None:
     cards = drag({"distribution": "measured-618", "num": 2000}).materials.values()
     rows = [[card.density, *(card.bending or ())[:2]] for card in cards]
     logarithms = np.log10(rows)
-    np.testing.assert_allclose(logarithms.mean(axis=0), fabrics.MEASURED_MEAN[:3], atol=0.04)
-    np.testing.assert_allclose(logarithms.std(axis=0), fabrics.MEASURED_DEVIATION[:3], atol=0.03)
-    correlations = np.array(fabrics.MEASURED_CORRELATION)[:3, :3]
+    np.testing.assert_allclose(logarithms.mean(axis=0), measured.MEASURED_MEAN[:3], atol=0.04)
+    np.testing.assert_allclose(logarithms.std(axis=0), measured.MEASURED_DEVIATION[:3], atol=0.03)
+    correlations = np.array(measured.MEASURED_CORRELATION)[:3, :3]
     np.testing.assert_allclose(np.corrcoef(logarithms.T), correlations, atol=0.04)
 
 
 def test_drawn_fabrics_soften_as_the_measured_ones() -> None:
     cards = drag({"distribution": "measured-618", "num": 2000}).materials.values()
     softening = [card.softening or np.nan for card in cards]
-    for share, value in fabrics.SOFTENING_QUANTILES:
+    for share, value in measured.SOFTENING_QUANTILES:
         assert np.quantile(softening, share) == pytest.approx(value, rel=0.06)
     assert np.min(softening) > 160.0
     assert np.max(softening) < 1090.0

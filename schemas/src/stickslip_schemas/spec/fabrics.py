@@ -7,7 +7,6 @@ many. Each of the three ends as a card with a name, so no other module knows whe
 import math
 import random
 from collections.abc import Mapping, Sequence
-from functools import cache
 from statistics import NormalDist
 from typing import Annotated, Any, Literal, Never, Self, TypeVar, get_args
 
@@ -26,6 +25,7 @@ from pydantic_core.core_schema import ErrorType
 
 from stickslip_schemas.base import WHOLE, Document, Float, content_key
 from stickslip_schemas.spec.axes import Seed, Shorthand, long_form
+from stickslip_schemas.spec.measured import measured_draw, measured_softening
 from stickslip_schemas.spec.names import Material
 from stickslip_schemas.spec.reality import measured_fabrics
 
@@ -369,26 +369,6 @@ DRAWN_MAX = 2_000
 TRIES_MAX = 100
 """Draws for each fabric: so many that none is one of cloth mean wrong ranges."""
 
-MEASURED_MEAN = (-0.777, -4.901, -5.077, -4.998)
-MEASURED_DEVIATION = (0.350, 0.611, 0.543, 0.561)
-MEASURED_CORRELATION = (
-    (1.0, 0.717, 0.717, 0.758),
-    (0.717, 1.0, 0.855, 0.900),
-    (0.717, 0.855, 1.0, 0.868),
-    (0.758, 0.900, 0.868, 1.0),
-)
-"""Statistics of 618 fabrics [Feng et al. 2022]: of log10 of the mass per area [kg/m^2], and of the
-rigidities along the warp, along the weft and at 45 degrees [N m]."""
-
-SOFTENING_QUANTILES = (
-    (0.05, 162.0),
-    (0.25, 275.0),
-    (0.50, 372.0),
-    (0.75, 540.0),
-    (0.95, 1088.0),
-)
-"""Quantiles of D0/|b| of the same fabrics [1/m], over warp and weft."""
-
 Range = tuple[Positive, Positive]
 
 
@@ -485,7 +465,7 @@ class FabricDistribution(Document):
             if isinstance(self.distribution, FabricRanges):
                 drawn = self.distribution.draw(normals)
             else:
-                drawn = _measured_draw(normals)
+                drawn = measured_draw(normals)
             density, warp, weft, diagonal = (_rounded(number) for number in drawn)
             if 0.01 <= density <= 5.0 and is_of_cloth(density, warp, weft):
                 twist = _rounded(twist_of(warp, weft, diagonal))
@@ -500,7 +480,7 @@ class FabricDistribution(Document):
     def _softening(self, share: float) -> float | None:
         """Return the curvature of softening [1/m] for a share of (0, 1), or None."""
         if not isinstance(self.distribution, FabricRanges):
-            return _rounded(_measured_softening(share))
+            return _rounded(measured_softening(share))
         if self.distribution.softening is None:
             return None
         low, high = self.distribution.softening
@@ -519,46 +499,6 @@ def is_of_cloth(density: float, warp: float, weft: float) -> bool:
     return all(low <= length <= high for length in lengths) and (
         1.0 / RATIO_MAX <= warp / weft <= RATIO_MAX
     )
-
-
-def _measured_draw(normals: Sequence[float]) -> tuple[float, float, float, float]:
-    """Return density, warp, weft and diagonal of one draw of the 618 fabrics [SI].
-
-    x = mean + sd L n, with the Cholesky factor L of the correlations and normal numbers n.
-    """
-    factor = _cholesky()
-    drawn = []
-    for mean, deviation, row in zip(MEASURED_MEAN, MEASURED_DEVIATION, factor, strict=True):
-        correlated = sum(weight * normal for weight, normal in zip(row, normals, strict=True))
-        drawn.append(10.0 ** (mean + deviation * correlated))
-    density, warp, weft, diagonal = drawn
-    return density, warp, weft, diagonal
-
-
-def _measured_softening(share: float) -> float:
-    """Return the quantile of D0/|b| of the 618 fabrics [1/m]; its logarithm is linear between.
-
-    The lowest and the highest known quantile stand for all beyond them.
-    """
-    (below, low), *_ = SOFTENING_QUANTILES
-    for at, value in SOFTENING_QUANTILES:
-        if share <= at:
-            part = 1.0 if at == below else (share - below) / (at - below)
-            return low * math.exp(max(part, 0.0) * math.log(value / low))
-        below, low = at, value
-    return low
-
-
-@cache
-def _cholesky() -> tuple[tuple[float, ...], ...]:
-    """Return the lower Cholesky factor of the correlations: (4, 4)."""
-    size = len(MEASURED_CORRELATION)
-    factor = [[0.0] * size for _ in range(size)]
-    for i in range(size):
-        for j in range(i + 1):
-            rest = MEASURED_CORRELATION[i][j] - sum(factor[i][k] * factor[j][k] for k in range(j))
-            factor[i][j] = math.sqrt(rest) if i == j else rest / factor[j][j]
-    return tuple(tuple(row) for row in factor)
 
 
 class _FabricShorthand(Shorthand):
