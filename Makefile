@@ -22,7 +22,7 @@ BENCHMARKS = $(filter-out $(addprefix benchmarks/, render_rod_set.py cloth_conta
 DISTRIBUTIONS = schemas sim_core measure services training workers workers/blender
 CPP_FILES = $(shell find sim_core/src sim_core/tests/core workers/blender/raster -name "*.[ch]pp")
 
-.PHONY: setup setup-dev demo test-fast test test-kernels test-slow test-main test-blender test-slow-main test-slow-blender test-without-blender test-core check complexity size density docs bench reality wheels release-wheels release-check constraints clean
+.PHONY: setup setup-dev demo test-fast test test-kernels test-slow test-main test-blender test-without-blender test-core check complexity size density docs bench reality wheels release-wheels release-check constraints clean
 
 # The environments that `make demo` and the service need. Tests and checks need more: setup-dev.
 setup: .venv/core.stamp .venv-blender/raster.stamp
@@ -88,7 +88,7 @@ test-without-blender: .venv/core.stamp .venv/dev.stamp
 # The core alone, on any system that has a C++20 compiler: CI runs it on arm64 and on macOS.
 test-core:
 	$(PYTHON) -m venv .venv-core
-	.venv-core/bin/python -m pip install $(PIP_FLAGS) ./sim_core pytest pytest-timeout hypothesis
+	.venv-core/bin/python -m pip install $(PIP_FLAGS) "./sim_core[protocols]" pytest pytest-timeout hypothesis
 	.venv-core/bin/python -m pytest --quiet -p no:cacheprovider --rootdir sim_core --confcutdir sim_core \
 	  --import-mode importlib -m "not slow" sim_core/tests
 
@@ -107,14 +107,8 @@ test-kernels: setup-dev
 complexity: setup-dev
 	$(PY) tools/complexity.py
 
-# Slow tests of the service mostly wait, so the others and the complexity of the core run beside them.
-test-slow: setup-dev
-	@$(MAKE) --no-print-directory --jobs=3 --output-sync=target --keep-going test-slow-main test-slow-blender complexity
-
-test-slow-main:
+test-slow: complexity
 	$(PYTEST) --numprocesses=$$((2 * $$(nproc))) --timeout=1200 -m slow
-
-test-slow-blender:
 	$(BLENDER_PY) -m pytest --quiet -m slow workers/blender
 
 check: setup-dev

@@ -90,20 +90,18 @@ def empty_database(
     database: str, tmp_path: Path, request: pytest.FixtureRequest
 ) -> Iterator[Callable[[], Database]]:
     """Makes databases without tables."""
-    databases: list[Database] = []
+    made: list[Database] = []
 
     def make() -> Database:
         url = None if database == "sqlite" else request.getfixturevalue("postgresql").empty()
-        databases.append(
-            connect(
-                Settings.chosen(data=tmp_path / str(len(databases)), durable=False, database=url)
-            )
+        made.append(
+            connect(Settings.chosen(data=tmp_path / str(len(made)), durable=False, database=url))
         )
-        return databases[-1]
+        return made[-1]
 
     yield make
-    for database_ in databases:
-        database_.close()
+    for one in made:
+        one.close()
 
 
 @pytest.fixture(autouse=True)
@@ -140,10 +138,10 @@ def context(settings: Settings, clock: ManualClock, migrated_file: Path) -> Iter
     if settings.database is None:
         settings.data.mkdir()
         copyfile(migrated_file, settings.database_path)
-    opened = Context.open(settings, clock)
-    start(opened)
-    yield opened
-    opened.close()
+    made = Context.open(settings, clock)
+    start(made)
+    yield made
+    made.close()
 
 
 @pytest.fixture

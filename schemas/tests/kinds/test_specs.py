@@ -188,13 +188,11 @@ def test_bad_specs_are_pointed_at(document: Any, pointer: str, rule: str, value:
 POINT = {"material": "royal-target", "mu": 0.1, "texture": "dots", "viewpoint": "left"}
 
 
-@pytest.mark.parametrize(
-    ("fields", "meant"), [({}, SELF_FRICTION), ({"self_friction": None}, None)]
-)
+@pytest.mark.parametrize(("given", "meant"), [({}, SELF_FRICTION), ({"self_friction": None}, None)])
 def test_dragged_cloth_has_self_contact_unless_its_spec_says_null(
-    fields: dict[str, Any], meant: float | None
+    given: dict[str, Any], meant: float | None
 ) -> None:
-    spec = job_spec_adapter.validate_python(CLOTH | fields)
+    spec = job_spec_adapter.validate_python(CLOTH | given)
     simulation = spec.simulation(POINT)
     assert isinstance(simulation, ClothDragSimulation)
     assert simulation.self_friction == meant
