@@ -88,7 +88,7 @@ test-without-blender: .venv/core.stamp .venv/dev.stamp
 # The core alone, on any system that has a C++20 compiler: CI runs it on arm64 and on macOS.
 test-core:
 	$(PYTHON) -m venv .venv-core
-	.venv-core/bin/python -m pip install $(PIP_FLAGS) ./sim_core pytest pytest-timeout hypothesis
+	.venv-core/bin/python -m pip install $(PIP_FLAGS) "./sim_core[protocols]" pytest pytest-timeout hypothesis
 	.venv-core/bin/python -m pytest --quiet -p no:cacheprovider --rootdir sim_core --confcutdir sim_core \
 	  --import-mode importlib -m "not slow" sim_core/tests
 

@@ -13,7 +13,7 @@ COPY workers workers
 # Two environments, because bpy needs NumPy 1 and zarr needs NumPy 2. The core is built once, here.
 RUN python -m venv /opt/stickslip/.venv \
  && /opt/stickslip/.venv/bin/pip install --no-cache-dir --constraint constraints.txt \
-      "./schemas[arrays,s3,sobol]" ./sim_core ./workers
+      "./schemas[arrays,s3,sobol]" "./sim_core[protocols]" ./workers
 RUN python -m venv /opt/stickslip/.venv-blender \
  && /opt/stickslip/.venv-blender/bin/pip install --no-cache-dir --constraint constraints-blender.txt \
       "./schemas[arrays,s3]" "./workers/blender[bpy]" ray

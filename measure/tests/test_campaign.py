@@ -6,12 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from stickslip_measure import experiments
-from stickslip_measure.campaign import Cell, Request, limit, measure, read_cell
+from stickslip_measure.campaign import Cell, Request, measure, read_cell
 from stickslip_measure.cli import main
+from stickslip_measure.convergence import converged
 from stickslip_measure.diagnosis import findings
 from stickslip_measure.experiments import capstan, drape, slopes, strips
 from stickslip_measure.page import write_page
 from stickslip_measure.process import Program
+from stickslip_sim_core.reference import master_curves
 
 Adapter = Callable[..., Program]
 
@@ -77,6 +79,18 @@ def test_a_campaign_goes_on_where_it_stopped(falling: Adapter, tmp_path: Path) -
     assert read_cell(path).reason == "ValueError: gone"
 
 
+def test_a_cell_whose_cpu_time_is_over_ends_and_finer_ones_are_not_run(
+    falling: Adapter, tmp_path: Path
+) -> None:
+    cells: list[Cell] = []
+    busy = falling(step="while time.process_time() < 0.3 + self.time: pass")
+    request = Request(busy, tmp_path, ("creep",), ("default",), 60.0, budget=0.5)
+    measure(request, cells.append)
+    states = {(cell.experiment, cell.cells): cell.state for cell in cells}
+    assert states["creep", 5] == "not finished"
+    assert states["creep", 10] == states["creep", 20] == "not run"
+
+
 def test_another_version_of_the_simulator_is_measured_anew(
     written: Callable[[str], Program], falling_text: str, tmp_path: Path
 ) -> None:
@@ -129,13 +143,38 @@ def test_a_damaged_cell_says_what_to_do(falling: Adapter, tmp_path: Path) -> Non
 
 
 def test_limit_and_order() -> None:
-    def cell(cells: int, value: float | None) -> Cell:
-        return Cell("s", "1", "default", "drape", cells, "measured", "", value, 1.0, 0.0, "")
+    trend = converged((10, 20, 40), [3.0 + 5.0 / n**2 for n in (10, 20, 40)], 3.0)
+    assert trend.limit == pytest.approx(3.0)
+    assert trend.order == pytest.approx(2.0)
+    assert trend.reason == ""
 
-    value, order = limit([cell(n, 3.0 + 5.0 / n**2) for n in (40, 10, 20)])
-    assert value == pytest.approx(3.0)
-    assert order == pytest.approx(2.0)
-    assert np.isnan(limit([cell(10, 1.0), cell(20, None), cell(40, 1.0)])[0])
+
+@pytest.mark.parametrize(
+    ("values", "expected", "reason"),
+    [
+        ([1.0, None, 1.0], 1.0, "needs three values"),
+        ([1.0, 1.1, 1.05], 1.0, "does not converge: goes up and down"),
+        ([1.0, 1.1, 1.3], 1.0, "does not converge: its changes fall by 0.5"),
+        ([1.0, 3.0, 3.002], 1.0, "does not converge: its changes fall by 1e+03"),
+    ],
+)
+def test_values_that_do_not_converge_have_no_limit(
+    values: list[float | None], expected: float, reason: str
+) -> None:
+    trend = converged((10, 20, 40), values, expected)
+    assert np.isnan(trend.limit)
+    assert np.isnan(trend.order)
+    assert trend.reason == reason
+
+
+@pytest.mark.parametrize(("expected", "spread"), [(2.0, 1e-3), (0.0, 0.005)])
+def test_values_that_hardly_change_have_a_limit_and_no_order(
+    expected: float, spread: float
+) -> None:
+    trend = converged((10, 20, 40), [expected, expected + spread, expected], expected)
+    assert trend.limit == expected
+    assert np.isnan(trend.order)
+    assert trend.reason == "does not change"
 
 
 def test_there_are_twelve_experiments_with_three_resolutions() -> None:
@@ -146,7 +185,7 @@ def test_there_are_twelve_experiments_with_three_resolutions() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--simulator", "bullet4"), "must be a Python file or one of stickslip"),
+        (("--simulator", "bullet4"), "must be a Python file or one of bullet, elastica"),
         (("--experiment", "fold"), "invalid choice: 'fold'"),
         (("--timeout", "-3"), "must be above 0 and below 1e6 s"),
         (("--setting", "best"), "invalid choice: 'best'"),
@@ -195,3 +234,14 @@ def test_the_ring_plate_is_a_cantilever_if_it_is_narrow(monkeypatch: pytest.Monk
 def test_the_drawn_cantilever_has_the_sag_of_the_master_curve() -> None:
     x, z = strips.heavy_line()
     assert strips.weight_of(-z[-1] / x[-1]) == pytest.approx(strips.GAMMA, rel=1e-4)
+
+
+@pytest.mark.parametrize("gamma", [1.0, 10.0, 200.0])
+def test_the_elastica_is_the_master_curve(gamma: float) -> None:
+    exact = float(master_curves.cantilever(gamma))
+    assert strips.master(gamma) == pytest.approx(exact, rel=1e-9)
+
+
+def test_the_buckling_weight_is_the_master_curve() -> None:
+    exact = float(master_curves.lateral_buckling(strips.ASPECT, 0.0))
+    assert pytest.approx(exact, rel=1e-7) == strips.BUCKLING

@@ -11,7 +11,7 @@ from stickslip_services.queue.failures import failed_tasks
 from stickslip_services.queue.jobs import find_job, lost_slots
 from stickslip_services.queue.submit import submit_job
 from stickslip_services.queue.task_log import TaskLog, read_task_log
-from stickslip_services.units import percent
+from stickslip_services.units import duration, percent
 from stickslip_testing.jobs import ManualClock, parsed, rods, show_job
 from stickslip_testing.servers import RunningServer
 from stickslip_testing.worker import PretendWorker, failure
@@ -144,3 +144,19 @@ def test_a_sample_of_a_failed_simulation_counts_as_lost(
 )
 def test_only_all_is_one_hundred_percent(part: int, whole: int, text: str) -> None:
     assert percent(part, whole) == text
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (0.0, "0 s"),
+        (1e-9, "0.1 ms"),
+        (0.004, "4 ms"),
+        (0.0996, "100 ms"),
+        (0.1, "0.1 s"),
+        (59.6, "60 s"),
+        (7800.0, "2 h 10 min"),
+    ],
+)
+def test_only_nothing_takes_no_time(seconds: float, text: str) -> None:
+    assert duration(seconds) == text

@@ -7,18 +7,19 @@ it stopped. A cell is measured again if the adapter or the experiments have chan
 import hashlib
 import json
 import math
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from stickslip_sim_core.protocols.result import Refinement
-
 from stickslip_measure import experiments
 from stickslip_measure.contract import SETTINGS
+from stickslip_measure.convergence import Convergence, converged
 from stickslip_measure.laboratory import Experiment, Laboratory
-from stickslip_measure.process import AdapterError, Description, Program, describe
+from stickslip_measure.process import AdapterError, Description, Program, SlowError, describe
 
 MEASURED = "measured"
+NOT_RUN = "not run"
 NOT_SUPPORTED = "not supported"
 
 CALIBRATED = "bending calibrated"
@@ -41,7 +42,7 @@ class Cell:
     experiment: str
     cells: int
     state: str
-    """"measured", or why there is no value: a state of process.py, or "not supported"."""
+    """"measured", or why there is no value: a state of process.py, "not supported", "not run"."""
 
     reason: str
     value: float | None
@@ -78,6 +79,9 @@ class Request:
     settings: Sequence[str] = SETTINGS
     seconds: float = 600.0
     """Time limit of a scene [s]."""
+
+    budget: float = 600.0
+    """Limit of the CPU time of a cell [s]."""
 
     retry: bool = False
     """Whether cells without a value are measured again."""
@@ -143,30 +147,46 @@ def _experiment(
     experiment: Experiment,
     softer: float,
 ) -> Iterator[Cell]:
-    key = _key(request.program, description, setting, softer)
+    key = _key(request.program, description, setting, softer, experiment)
+    slow = False
     for cells in experiment.cells:
         path = _path(request, description, row, experiment, cells)
         if path.exists():
             known = read_cell(path)
             if known.key == key and (known.value is not None or not request.retry):
+                slow = slow or known.state == SlowError.state
                 yield known
                 continue
         log = path.with_suffix(".log")
         path.parent.mkdir(parents=True, exist_ok=True)
-        laboratory = Laboratory(request.program, description, setting, log, request.seconds, softer)
-        cell = _cell(laboratory, experiment, cells, row, key)
+        laboratory = Laboratory(
+            request.program, description, setting, log, request.seconds, request.budget, softer
+        )
+        cell = _cell(laboratory, experiment, cells, row, key, slow)
+        slow = slow or cell.state == SlowError.state
         _write(path, cell)
         yield cell
 
 
-def _cell(laboratory: Laboratory, experiment: Experiment, cells: int, row: str, key: str) -> Cell:
-    """Measure a cell. Whatever goes wrong in the adapter is its reason."""
+def _cell(
+    laboratory: Laboratory, experiment: Experiment, cells: int, row: str, key: str, slow: bool
+) -> Cell:
+    """Measure a cell. Whatever goes wrong in the adapter is its reason.
+
+    `slow` says that a coarser resolution took too much time already, so this one is not run.
+    """
     description = laboratory.description
     facts = (description.name, description.version, row, experiment.name, cells)
     missing = sorted(experiment.needs - description.capabilities)
+    # Who has rods only has no cloth, which all other experiments need.
+    if description.capabilities == {"rods"} and "rods" not in experiment.needs:
+        missing = ["cloth"]
     if missing:
         reason = f"needs {', '.join(missing)}"
         return Cell(*facts, NOT_SUPPORTED, reason, None, None, 0.0, key)
+    if slow:
+        reason = "a coarser resolution was not finished"
+        return Cell(*facts, NOT_RUN, reason, None, None, 0.0, key)
     with laboratory:
         try:
             reading = experiment.measure(laboratory, cells)
@@ -197,12 +217,16 @@ def _path(
     return request.out / description.name / row / f"{experiment.name}-{cells}.json"
 
 
-def _key(program: Program, description: Description, setting: str, softer: float) -> str:
+def _key(
+    program: Program, description: Description, setting: str, softer: float, experiment: Experiment
+) -> str:
     """Return a digest of all that decides a cell: of the simulator itself, its version."""
     digest = hashlib.sha256()
-    # A changed experiment changes the meaning of its value.
-    sources = sorted(Path(__file__).parent.glob("experiments/*.py"))
-    for path in (program.adapter, Path(__file__).with_name("laboratory.py"), *sources):
+    # A changed experiment changes the meaning of its value. Each stands in one module.
+    source = Path(sys.modules[experiment.measure.__module__].__file__ or "")
+    # Adapters of one simulator may share a file, whose name begins with an underscore.
+    shared = sorted(program.adapter.parent.glob("_*.py"))
+    for path in (program.adapter, *shared, Path(__file__).with_name("laboratory.py"), source):
         digest.update(path.read_bytes())
     digest.update(f"{program.python} {description.version} {setting} {softer!r}".encode())
     return digest.hexdigest()
@@ -232,19 +256,8 @@ def read_cells(out: Path) -> list[Cell]:
     return [read_cell(path) for path in sorted(out.glob("*/*/*-*.json"))]
 
 
-def limit(cells: Sequence[Cell]) -> tuple[float, float]:
-    """Return the limit of small cells and the order of an experiment [Richardson 1911].
-
-    The order is NaN if three values show none; the limit then assumes order 2. Both are NaN if a
-    value is missing.
-    """
+def convergence(cells: Sequence[Cell]) -> Convergence:
+    """Return what the resolutions of an experiment on one row show."""
     ordered = sorted(cells, key=lambda cell: cell.cells)
-    values = [cell.value for cell in ordered if cell.value is not None]
-    if len(values) != 3:
-        return math.nan, math.nan
-    refinement = Refinement.of(
-        tuple((float(cell.cells),) for cell in ordered),
-        tuple((1.0 / cell.cells,) for cell in ordered),
-        tuple((value,) for value in values),
-    )
-    return refinement.limit[0], refinement.order[0]
+    expected = next((cell.expected for cell in ordered if cell.expected is not None), math.nan)
+    return converged([cell.cells for cell in ordered], [cell.value for cell in ordered], expected)

@@ -17,7 +17,7 @@ ADAPTERS = Path(__file__).parent / "adapters"
 
 def adapter_names() -> list[str]:
     """Return the names of the adapters that come with the package."""
-    return sorted(path.stem for path in ADAPTERS.glob("*.py") if path.stem != "__init__")
+    return sorted(path.stem for path in ADAPTERS.glob("*.py") if not path.stem.startswith("_"))
 
 
 def adapter_path(text: str) -> Path:
@@ -86,6 +86,12 @@ def parser() -> argparse.ArgumentParser:
         "--timeout", type=positive_seconds, default=600.0, help="limit of a scene in s (600)"
     )
     command.add_argument(
+        "--budget",
+        type=positive_seconds,
+        default=600.0,
+        help="limit of the CPU time of a cell in s (600)",
+    )
+    command.add_argument(
         "--retry", action="store_true", help="measure cells without a value once more"
     )
     command.add_argument("--version", action="version", version=__version__)
@@ -111,6 +117,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             options.experiment or list(experiments.EXPERIMENTS),
             options.setting or SETTINGS,
             options.timeout,
+            options.budget,
             options.retry,
         )
         try:

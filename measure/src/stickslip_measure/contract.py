@@ -98,6 +98,34 @@ class Sheet:
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
     """Acceleration at the start [m/s^2]. `set_gravity` changes it."""
 
+    def masses(self) -> Floats:
+        """Return the mass of each vertex (V,) [kg]: a third of each of its triangles."""
+        first, second, third = np.moveaxis(self.rest[self.triangles], 1, 0)
+        a = second - first
+        b = third - first
+        areas = 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+        shares = np.repeat(self.density * areas / 3.0, 3)
+        masses = np.zeros(len(self.rest))
+        np.add.at(masses, self.triangles.ravel(), shares)
+        return masses
+
+    def flat(self) -> Floats:
+        """Return `rest` in three dimensions, at z = 0: (V, 3) [m]."""
+        return np.column_stack([self.rest, np.zeros(len(self.rest))])
+
+    def is_curved(self) -> bool:
+        """Return whether a sheet starts bent or strained, and not as its rest shape moved."""
+        for number in range(int(self.sheet.max()) + 1):
+            chosen = self.sheet == number
+            flat = self.flat()[chosen] - self.flat()[chosen].mean(axis=0)
+            start = self.start[chosen] - self.start[chosen].mean(axis=0)
+            # The best rotation has the left and right singular vectors of the covariance [Kabsch].
+            u, _, v = np.linalg.svd(flat.T @ start)
+            u[:, 2] *= np.sign(np.linalg.det(u @ v))
+            if np.abs(flat @ u @ v - start).max() > 1e-6 * self.cell:
+                return True
+        return False
+
 
 @dataclass(frozen=True)
 class Rod:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from statistics import median
 
 from stickslip_measure import experiments
-from stickslip_measure.campaign import CALIBRATED, Cell, limit
+from stickslip_measure.campaign import CALIBRATED, Cell, convergence
 
 UNIT = 1e-3
 """Largest deviation of the size at the start."""
@@ -17,8 +17,11 @@ CLOCK = 0.02
 UNITS = (1e-3, 1e3)
 """Accelerations over g of a simulator that takes millimetres for metres, or metres for them."""
 
-EQUAL_MASSES = 0.25
-"""Tilt over that of equal masses from which on masses are wrong."""
+EQUAL_MASSES = 0.05
+"""Largest deviation of a tilt from that of equal masses, for which masses are wrong.
+
+A plate that tilts by another angle has not settled, or its solver has not converged.
+"""
 
 CLAMP = 0.25
 """Distance of the clamp from its place from which on it is wrong [cells]."""
@@ -91,7 +94,7 @@ def clock(row: Rows) -> Finding | None:
 def masses(row: Rows) -> Finding | None:
     """Find vertices that all have the same mass."""
     cell = _only(row, "balance")
-    if cell is None or cell.value is None or abs(cell.value) < EQUAL_MASSES:
+    if cell is None or cell.value is None or abs(cell.value - 1.0) > EQUAL_MASSES:
         return None
     return Finding(
         "vertex masses are wrong",
@@ -160,11 +163,21 @@ def _only(row: Rows, name: str) -> Cell | None:
     return cells[0] if cells else None
 
 
+def _settled_value(cells: Sequence[Cell]) -> float:
+    """Return the limit of an experiment, or its finest value if all of them are near it."""
+    known = convergence(cells).limit
+    values = [cell.value for cell in sorted(cells, key=lambda cell: cell.cells) if cell.value]
+    if not math.isnan(known) or len(values) < len(cells) or not values:
+        return known
+    spread = max(abs(value / values[-1] - 1.0) for value in values)
+    return values[-1] if spread < AGREEMENT else math.nan
+
+
 def _factor(row: Rows, names: Sequence[str], quantity: str) -> Finding | None:
     """Find a factor on which the limits of several experiments agree."""
     limits = {}
     for name in names:
-        value = limit(row.get(name, []))[0]
+        value = _settled_value(row.get(name, []))
         if not math.isnan(value):
             limits[name] = value
     if len(limits) < AGREEING:

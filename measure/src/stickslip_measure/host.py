@@ -72,8 +72,9 @@ class Host:
 
     def describe(self, header: dict[str, Any], arrays: list[Any]) -> tuple[Any, list[Any]]:
         """Import the adapter, and return what it says about itself."""
-        # An adapter may import files beside it.
-        sys.path.insert(0, str(self.adapter.parent))
+        # An adapter may import files beside it. They come last: an adapter often has the name of
+        # the simulator that it imports.
+        sys.path.append(str(self.adapter.parent))
         self.simulator = load(self.adapter, "stickslip_adapter").Simulator
         settings = {name: dict(facts) for name, facts in self.simulator.settings.items()}
         return {

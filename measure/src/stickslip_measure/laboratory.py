@@ -1,5 +1,6 @@
 """What an experiment is, and what it gets: a laboratory that opens scenes on one simulator."""
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -94,6 +95,7 @@ class Laboratory:
         setting: Row of its settings.
         log: File for what its processes print.
         seconds: Time limit of a scene [s].
+        budget: Limit of the CPU time of all scenes together [s].
         softer: Factor on the bending stiffness of each scene, which calibrates a simulator whose
             own is off.
     """
@@ -105,6 +107,7 @@ class Laboratory:
         setting: str,
         log: Path,
         seconds: float,
+        budget: float = math.inf,
         softer: float = 1.0,
     ) -> None:
         self.program = program
@@ -112,6 +115,7 @@ class Laboratory:
         self.setting = setting
         self.log = log
         self.seconds = seconds
+        self.budget = budget
         self.softer = softer
         self.processes: list[AdapterProcess] = []
 
@@ -141,7 +145,8 @@ class Laboratory:
         # Each scene is a new process: nothing of the last one may leak into it.
         for process in self.processes:
             process.close()
-        process = AdapterProcess(self.program, self.log, self.seconds)
+        left = self.budget - self.cpu
+        process = AdapterProcess(self.program, self.log, self.seconds, left)
         self.processes.append(process)
         return Simulation(process, scene, self.setting)
 

@@ -13,7 +13,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from stickslip_measure import __version__, experiments
-from stickslip_measure.campaign import MEASURED, Cell, limit, read_cells
+from stickslip_measure.campaign import MEASURED, Cell, convergence, read_cells
 from stickslip_measure.diagnosis import CREEP, findings, row_of
 from stickslip_measure.laboratory import Experiment
 
@@ -181,12 +181,22 @@ def resolution_entries(experiment: Experiment, measured: Sequence[Cell]) -> str:
             entries.append(f'<td class="reason">{escape(cell.state)}: {escape(cell.reason)}</td>')
         else:
             entries.append(f"<td>{cell.value:.5g}</td>")
-    limit_value, order = limit(measured)
-    entries.append(f"<td>{number(limit_value)}</td><td>{number(order)}</td>")
+    entries.append(limit_entries(measured))
     cell = by_cells.get(experiment.default)
     entries.append(f"<td>{error_text(cell, experiment) if cell is not None else '–'}</td>")
     entries.append(f"<td>{sum(cell.cpu for cell in measured):.1f}</td>")
     return "".join(entries)
+
+
+def limit_entries(measured: Sequence[Cell]) -> str:
+    """Return limit and order, or why the resolutions show none."""
+    trend = convergence(measured)
+    if math.isnan(trend.limit):
+        # A cell without a value has said why.
+        missing = any(cell.value is None for cell in measured)
+        return f'<td class="reason" colspan="2">{"–" if missing else escape(trend.reason)}</td>'
+    order = number(trend.order) if not trend.reason else escape(trend.reason)
+    return f"<td>{number(trend.limit)}</td><td>{order}</td>"
 
 
 def number(value: float) -> str:

@@ -1,5 +1,6 @@
 """Runs a scene on an adapter in a process of its own, and says why if that fails."""
 
+import math
 import os
 import selectors
 import signal
@@ -111,11 +112,15 @@ class AdapterProcess:
         program: Adapter and interpreter.
         log: File for everything that the process prints.
         seconds: Time limit of the whole process [s].
+        budget: Limit of its CPU time [s], which does not depend on what else the machine does.
     """
 
-    def __init__(self, program: Program, log: Path, seconds: float) -> None:
+    def __init__(
+        self, program: Program, log: Path, seconds: float, budget: float = math.inf
+    ) -> None:
         self.log = log
         self.seconds = seconds
+        self.budget = budget
         self.deadline = time.monotonic() + seconds
         self.cpu = 0.0
         """CPU time of the process at its last reply [s]."""
@@ -306,6 +311,11 @@ class Simulation:
             raise ContractError(f"positions: must have shape {shape[1:]}, got {frames.shape[1:]}")
         _check_finite(frames, self.time)
         self.positions = frames[-1]
+        if self._process.cpu > self._process.budget:
+            raise SlowError(
+                f"the CPU time of the cell was over after {self.time:.3g} s of the scene "
+                f"({done + len(batch)} of {total} steps of this part)"
+            )
         return np.asarray(frames)
 
     def rest(self, seconds: float, gravity: Floats) -> Floats:

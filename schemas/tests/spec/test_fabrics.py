@@ -12,7 +12,7 @@ from stickslip_schemas.kinds.cloth_drag import ClothDragSpec
 from stickslip_schemas.kinds.cloth_scene import ClothSceneSimulation, ClothSceneSpec
 from stickslip_schemas.plan.builds import Builds
 from stickslip_schemas.plan.points import keyed_points
-from stickslip_schemas.spec import fabrics
+from stickslip_schemas.spec import fabrics, measured
 from stickslip_schemas.spec.fabrics import FabricNumbers
 from stickslip_schemas.spec.reality import measured_fabrics
 
@@ -79,7 +79,11 @@ def errors(wrong: dict[str, Any]) -> list[FieldError]:
             "greater than 0",
         ),
         ({"bending": {"warp": 10, "weft": 9, "diagonal": 9}}, "/bending/unit", "required"),
-        ({"softening": 300.0}, "/softening", "constant rigidity"),
+        ({"softening": -300.0}, "/softening", "a negative b softens"),
+        ({"softening": 3.0}, "/softening", "is it in 1/cm?"),
+        ({"softening": 0.3}, "/softening", "is it in 1/mm?"),
+        ({"softening": float("nan")}, "/softening", "finite number"),
+        ({"softening": "soft"}, "/softening", "valid number"),
         ({"stretching": "gray-interlok"}, "/stretching", "did you mean gray-interlock"),
         ({"bending": None}, "", "bending must be given"),
     ],
@@ -106,10 +110,29 @@ def test_drawn_fabrics_have_the_statistics_of_the_measured_ones() -> None:
     cards = drag({"distribution": "measured-618", "num": 2000}).materials.values()
     rows = [[card.density, *(card.bending or ())[:2]] for card in cards]
     logarithms = np.log10(rows)
-    np.testing.assert_allclose(logarithms.mean(axis=0), fabrics.MEASURED_MEAN[:3], atol=0.04)
-    np.testing.assert_allclose(logarithms.std(axis=0), fabrics.MEASURED_DEVIATION[:3], atol=0.03)
-    correlations = np.array(fabrics.MEASURED_CORRELATION)[:3, :3]
+    np.testing.assert_allclose(logarithms.mean(axis=0), measured.MEASURED_MEAN[:3], atol=0.04)
+    np.testing.assert_allclose(logarithms.std(axis=0), measured.MEASURED_DEVIATION[:3], atol=0.03)
+    correlations = np.array(measured.MEASURED_CORRELATION)[:3, :3]
     np.testing.assert_allclose(np.corrcoef(logarithms.T), correlations, atol=0.04)
+
+
+def test_drawn_fabrics_soften_as_the_measured_ones() -> None:
+    cards = drag({"distribution": "measured-618", "num": 2000}).materials.values()
+    softening = [card.softening or np.nan for card in cards]
+    for share, value in measured.SOFTENING_QUANTILES:
+        assert np.quantile(softening, share) == pytest.approx(value, rel=0.06)
+    assert np.min(softening) > 160.0
+    assert np.max(softening) < 1090.0
+
+
+def test_ranges_draw_softening_only_if_they_say_so() -> None:
+    ranges = {"density": [0.1, 0.3], "unit": "uN m"}
+    ranges |= {name: [5.0, 20.0] for name in ("warp", "weft", "diagonal")}
+    plain = drag({"distribution": ranges, "num": 5}).materials.values()
+    soft = drag({"distribution": ranges | {"softening": [200.0, 400.0]}, "num": 5})
+    assert {card.softening for card in plain} == {None}
+    assert all(200.0 <= (card.softening or 0.0) <= 400.0 for card in soft.materials.values())
+    assert [card.density for card in soft.materials.values()] == [card.density for card in plain]
 
 
 def test_more_draws_keep_the_first_ones() -> None:

@@ -2,9 +2,15 @@
 
 
 def duration(seconds: float) -> str:
-    """Return a time span: 4 ms, 0.4 s, 9.0 s, 40 s, 4 min, 2 h 10 min."""
-    if 0 < seconds < 0.1:
-        return f"{1000 * seconds:.2g} ms"
+    """Return a time span: 4 ms, 0.4 s, 9.0 s, 40 s, 4 min, 2 h 10 min.
+
+    The least is 0.1 ms, and only nothing is 0 s.
+    """
+    if seconds <= 0:
+        return "0 s"
+    milliseconds = max(1000 * seconds, 0.1)
+    if milliseconds < 100:
+        return f"{milliseconds:.2g} ms" if milliseconds < 10 else f"{milliseconds:.0f} ms"
     if seconds < 90:
         return f"{seconds:.1f} s" if seconds < 10 else f"{seconds:.0f} s"
     minutes = round(seconds / 60)

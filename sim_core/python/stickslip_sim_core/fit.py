@@ -3,7 +3,8 @@
 The residual is that of the observations over their noise, and its Jacobian has the derivatives of
 the run by the parameters. `scipy.optimize.least_squares` finds a minimum. A residual may have
 several: cloth that falls to another side is another branch. A fit therefore goes on from other
-starts until the observations are explained by their noise, and says how many minima it saw.
+starts until the observations are explained by their noise, and says how many minima it saw. SciPy
+comes with the extra `fit`.
 """
 
 from collections.abc import Mapping, Sequence

@@ -25,7 +25,7 @@ namespace {
 using BodyTuple = std::tuple<int, std::vector<double>, Eigen::Vector3d, double, Eigen::Vector3d,
                              Eigen::Matrix3d, std::vector<double>>;
 
-using FabricTuple = std::tuple<double, StretchTable, Eigen::Matrix3d, double>;
+using FabricTuple = std::tuple<double, StretchTable, Eigen::Matrix3d, double, double>;
 
 using BodyRateTuple = std::tuple<Eigen::Vector3d, Eigen::Vector3d>;
 using SensitivityTermTuple = std::tuple<int, int, int, double>;
@@ -179,8 +179,8 @@ void bind_cloth(nb::module_& m) {
              const std::vector<std::int32_t>& surface_of_vertex, const Points3& surface_positions,
              const std::vector<double>& crease, const Eigen::MatrixXd& mu_static) {
             std::vector<ClothProperties> list;
-            for (const auto& [density, stretching, rigidity, damping] : fabrics) {
-              list.push_back({density, stretching, rigidity, damping});
+            for (const auto& [density, stretching, rigidity, damping, softening] : fabrics) {
+              list.push_back({density, stretching, rigidity, damping, softening});
             }
             new (self)
                 ClothSolver({rest,

@@ -65,10 +65,18 @@ Bending::Bending(const ClothMesh& mesh, const std::vector<Stencil>& stencils,
   for (const ClothProperties& fabric : fabrics.list) {
     const Rigidity& d = fabric.rigidity;
     rigidity_.insert(rigidity_.end(), {d(0, 0), d(0, 1), d(0, 2), d(1, 1), d(1, 2), d(2, 2)});
+    softening_.push_back({fabric.softening, std::sqrt(d(0, 0) * d(1, 1))});
   }
-  data_ = {count,           begin_.data(),    nodes_.data(),
-           weights_.data(), area_.data(),     spacing2_.data(),
-           fabric_.data(),  rigidity_.data(), slot_begin_.data(),
+  data_ = {count,
+           begin_.data(),
+           nodes_.data(),
+           weights_.data(),
+           area_.data(),
+           spacing2_.data(),
+           fabric_.data(),
+           rigidity_.data(),
+           softening_.data(),
+           slot_begin_.data(),
            slots_.data()};
 }
 
@@ -183,7 +191,7 @@ void Assembly::reserve_folds() {
   fold_begin_.assign(data.triangles + 1, 0);
   fold_nodes_.assign(data.begin[data.triangles], 0);
   fold_vectors_.assign(8L * data.begin[data.triangles], 0.0f);
-  fold_coefficients_.assign(2L * data.triangles, 0.0f);
+  fold_coefficients_.assign(3L * data.triangles, 0.0f);
   folds_ = {numbering.free_nodes,     approximation_.fold_min, 0,
             fold_begin_.data(),       fold_nodes_.data(),      fold_vectors_.data(),
             fold_coefficients_.data()};

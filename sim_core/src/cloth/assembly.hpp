@@ -26,6 +26,7 @@ class Bending {
   std::vector<int> begin_{0}, nodes_, slot_begin_, slots_, fabric_;
   Buffer<double> weights_;
   std::vector<double> area_, spacing2_, rigidity_;
+  std::vector<SofteningData> softening_;
   BendingData data_{};
 };
 

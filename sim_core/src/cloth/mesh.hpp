@@ -56,7 +56,8 @@ struct ClothProperties {
   double density;  // kg/m^2
   StretchTable stretching;
   Rigidity rigidity;
-  double damping;  // proportional to mass, 1/s
+  double damping;          // proportional to mass, 1/s
+  double softening = 0.0;  // k_s, 1/m: see kernels/bending.hpp; 0: none
 };
 
 // The fabrics of a cloth: one for all of its sheets, or one for each.

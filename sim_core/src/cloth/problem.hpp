@@ -47,24 +47,31 @@ struct MembraneData {
                       // null: nothing
 };
 
+// How the rigidity of a fabric falls with curvature; see kernels/bending.hpp.
+struct SofteningData {
+  double curvature = 0.0;  // k_s, 1/m; 0: it does not fall
+  double rigidity = 0.0;   // D, N m: the geometric mean of warp and weft
+};
+
 // Of each triangle the second derivatives (H11, H22, 2 H12) are linear in the positions of the
 // nodes of its stencil.
 struct BendingData {
   int triangles;
-  const int* begin;        // (triangles + 1)
-  const int* nodes;        // by stencil entry
-  const double* weights;   // (entries, 4): of H11, H22, 2 H12, and 0; 1/m^2
-  const double* area;      // (triangles), m^2
-  const double* spacing2;  // (triangles), m^2: square of the length over which a fold turns
-  const int* fabric;       // (triangles)
-  const double* rigidity;  // (fabrics, 6): 11 12 16 22 26 66, N m
-  const int* slot_begin;   // (triangles): first slot of the lower pairs (i, j <= i) of the stencil,
-                           // in order
-  const int* slots;        // scalar slots of (i, j) and (j, i), -1 for held nodes
+  const int* begin;                // (triangles + 1)
+  const int* nodes;                // by stencil entry
+  const double* weights;           // (entries, 4): of H11, H22, 2 H12, and 0; 1/m^2
+  const double* area;              // (triangles), m^2
+  const double* spacing2;          // (triangles), m^2: square of the length over which a fold turns
+  const int* fabric;               // (triangles)
+  const double* rigidity;          // (fabrics, 6): 11 12 16 22 26 66, N m
+  const SofteningData* softening;  // (fabrics)
+  const int* slot_begin;  // (triangles): first slot of the lower pairs (i, j <= i) of the stencil,
+                          // in order
+  const int* slots;       // scalar slots of (i, j) and (j, i), -1 for held nodes
 };
 
 // The part of bending's matrix that sharp folds add: of each, with vectors a and b over the free
-// nodes of its stencil, aa a a^T + ab (a b^T + b a^T).
+// nodes of its stencil, aa a a^T + ab (a b^T + b a^T) + bb b b^T.
 struct FoldData {
   int free_nodes;
   double smallest;  // s from which a triangle is a fold
@@ -72,7 +79,7 @@ struct FoldData {
   int* begin;           // (triangles + 1)
   int* nodes;           // by entry
   float* vectors;       // (entries, 2, 4): a and b, 1/m^2 times m and N m
-  float* coefficients;  // (triangles, 2): aa, ab
+  float* coefficients;  // (triangles, 3): aa, ab, bb
 };
 
 // K = mass + bending (x) 1 + membrane + folds + pairs, over the free nodes.

@@ -1,6 +1,7 @@
 """Energies of a cloth: derivatives by finite differences, what costs nothing, and plates."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -62,10 +63,27 @@ def folded(mesh: Mesh) -> Floats:
     return at + noise
 
 
+SOFT = {
+    "isotropic": replace(SHEET, softening=100.0),
+    # Its twist is soft, and warp and weft are unlike.
+    "orthotropic": replace(
+        SHEET, rigidity=np.diag([2e-5, 4e-6, 1e-6]), softening=150.0, name="orthotropic"
+    ),
+}
+"""Fabrics whose rigidity falls with curvature."""
+
+
+def fabric_of(name: str) -> Fabric:
+    of_tests = {"isotropic": SHEET, **{f"soft {name}": soft for name, soft in SOFT.items()}}
+    return of_tests[name] if name in of_tests else fabric(name)
+
+
 STATES: dict[str, Callable[[Mesh], Floats]] = {"flat": flat, "waved": waved, "folded": folded}
 
 
-@pytest.mark.parametrize("material", ["isotropic", "gray-interlock"])
+@pytest.mark.parametrize(
+    "material", ["isotropic", "gray-interlock", "soft isotropic", "soft orthotropic"]
+)
 @pytest.mark.parametrize("state", STATES)
 @pytest.mark.parametrize("name", MESHES)
 def test_gradient(name: str, state: str, material: str) -> None:
@@ -73,7 +91,7 @@ def test_gradient(name: str, state: str, material: str) -> None:
     there.
     """
     mesh = MESHES[name]
-    cloth = cloth_of(mesh, SHEET if material == "isotropic" else fabric(material))
+    cloth = cloth_of(mesh, fabric_of(material))
     at = STATES[state](mesh)
     gradient = energy(cloth, at)[2]
     rng = np.random.default_rng(2)
@@ -92,7 +110,16 @@ def test_gradient(name: str, state: str, material: str) -> None:
     ("material", "state"),
     [
         ("isotropic", "flat"),
-        *((m, s) for m in ("isotropic", "navy-sparkle-sweat") for s in ("waved", "folded")),
+        *(
+            (material, state)
+            for material in (
+                "isotropic",
+                "navy-sparkle-sweat",
+                "soft isotropic",
+                "soft orthotropic",
+            )
+            for state in ("waved", "folded")
+        ),
     ],
 )
 @pytest.mark.parametrize("name", MESHES)
@@ -101,7 +128,7 @@ def test_matrix(name: str, state: str, material: str) -> None:
     degrees, too.
     """
     mesh = MESHES[name]
-    of = SHEET if material == "isotropic" else fabric(material)
+    of = fabric_of(material)
     cloth = cloth_of(mesh, of)
     at = STATES[state](mesh)
     rng = np.random.default_rng(3)
@@ -110,7 +137,8 @@ def test_matrix(name: str, state: str, material: str) -> None:
     ends = [energy(cloth, at + times * h * v)[2] for times in (2.0, 1.0, -1.0, -2.0)]
     difference = (-ends[0] + 8.0 * ends[1] - 8.0 * ends[2] + ends[3]) / (12.0 * h)
     sheet = mesh.rest, mesh.triangles, of.density, of.stretching, of.rigidity
-    Kv, Kw = (np.asarray(_testing.stiffness_times(*sheet, at, u)) for u in (v, w))
+    soft = of.softening or 0.0
+    Kv, Kw = (np.asarray(_testing.stiffness_times(*sheet, at, u, soft)) for u in (v, w))
     assert np.linalg.norm(Kv - difference) < 1e-6 * np.linalg.norm(difference)
     assert float((Kv * w).sum()) == pytest.approx(float((Kw * v).sum()), rel=1e-5)
 
@@ -197,3 +225,43 @@ def test_linear_plate(kind: MeshKind) -> None:
     assert sag[clamped.tip].mean() == pytest.approx(
         density * g * LENGTH**4 / (8.0 * rigidity), rel=8e-4
     )
+
+
+def test_moment_falls_behind_curvature_up_to_half_of_its_bound() -> None:
+    """A strip on a cylinder: the energy per area is that of M = (D - |b| k) k, then of D k/2."""
+    rigidity, softening = 1e-5, 100.0
+    plain = isotropic(0.2, 50.0, rigidity)
+    soft = replace(plain, softening=softening)
+    mesh = meshes.grid(0.02, 0.04, 8, 64)
+    for curvature in (5.0, 30.0, 50.0, 80.0):
+        x, y = mesh.rest.T
+        rolled = np.column_stack(
+            [x, np.sin(curvature * y) / curvature, (1.0 - np.cos(curvature * y)) / curvature]
+        )
+        energies = [energy(cloth_of(mesh, of), rolled)[1] for of in (plain, soft)]
+        corner = min(curvature, 0.5 * softening)
+        expected = 0.5 * corner**2 - corner**3 / (3.0 * softening)
+        expected += 0.25 * (curvature**2 - corner**2)
+        assert energies[1] / energies[0] == pytest.approx(expected / (0.5 * curvature**2), rel=1e-3)
+
+
+def test_soft_bending_is_convex_in_curvature_whatever_warp_and_weft_are() -> None:
+    """No direction of bending of a bent sheet has a negative stiffness."""
+    soft = replace(
+        isotropic(0.2, 50.0, 1e-5),
+        rigidity=np.diag([2e-5, 1e-6, 1e-6]),
+        softening=100.0,
+        name="unlike",
+    )
+    mesh = meshes.grid(0.02, 0.02, 6, 6)
+    x, y = mesh.rest.T
+    rng = np.random.default_rng(4)
+    # Shallow shapes: their curvatures are linear in the heights.
+    for height in (1e-4, 3e-4, 1e-3):
+        bent = np.column_stack([x, y, height * (1e4 * x**2 + 3e3 * x * y)])
+        sheet = mesh.rest, mesh.triangles, soft.density, 0.0 * soft.stretching + 1e-9, soft.rigidity
+        for _ in range(20):
+            w = np.zeros_like(bent)
+            w[:, 2] = rng.normal(size=len(x))
+            forces = np.asarray(_testing.stiffness_times(*sheet, bent, w, 100.0))
+            assert float((forces * w).sum()) > 0.0

@@ -132,6 +132,12 @@ CASES = {
         parameter=fabric_factor("bending"),
         fabric=lambda value: fabric("gray-interlock").scaled(bending=np.exp(value)),
     ),
+    "bending of a fabric that softens": Strip(
+        parameter=fabric_factor("bending"),
+        fabric=lambda value: replace(
+            fabric("gray-interlock").scaled(bending=np.exp(value)), softening=160.0
+        ),
+    ),
     "bending of a fabric that stiffens": Strip(
         parameter=fabric_factor("bending"),
         fabric=lambda value: fabric("navy-sparkle-sweat").scaled(bending=np.exp(value)),

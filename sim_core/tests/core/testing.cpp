@@ -113,11 +113,12 @@ NB_MODULE(_testing, m) {
       "stiffness_times",
       [](const Points2& rest, const Triangles& triangles, double density,
          const StretchTable& stretching, const Eigen::Matrix3d& rigidity, const Points3& x,
-         const Points3& v) {
+         const Points3& v, double softening) {
         const ClothMesh mesh(rest, triangles);
         const MatrixApproximation exact{0.0, 0.0};  // no fold is too small, and none is old
         Assembly assembly(kernel_level("").cloth, mesh,
-                          Fabrics(mesh, {{density, stretching, rigidity, 0.0}}), {}, 0, exact);
+                          Fabrics(mesh, {{density, stretching, rigidity, 0.0, softening}}), {}, 0,
+                          exact);
         const std::vector<int>& node = assembly.numbering.node;
         Buffer<double> at(4 * x.rows());
         Buffer<float> in(4 * x.rows()), out(4 * x.rows());
@@ -133,7 +134,7 @@ NB_MODULE(_testing, m) {
         return result;
       },
       "rest"_a, "triangles"_a, "density"_a, "stretching"_a, "rigidity"_a, "x"_a, "v"_a,
-      "K v with the matrix of Newton's method at x, without mass.");
+      "softening"_a = 0.0, "K v with the matrix of Newton's method at x, without mass.");
   m.def(
       "contact_candidates",
       [](const Triangles& triangles, const Points3& x, double reach) {

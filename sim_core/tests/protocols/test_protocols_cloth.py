@@ -231,6 +231,7 @@ class TestPresets:
             "gripper",
             "stick-slip",
             "cantilever",
+            "soft-cantilever",
             "lateral-buckling",
             "inclined-plane",
         }

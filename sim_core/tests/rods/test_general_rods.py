@@ -9,12 +9,8 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from stickslip_sim_core import RodSolution, _sim_core, solve_general_rods, solve_rods
-from stickslip_sim_core.rods.solve import (
-    CLAMP_FRAME,
-    bspline_matrix,
-    clamp_quaternions,
-    interpolation_matrix,
-)
+from stickslip_sim_core.rods.solve import CLAMP_FRAME, clamp_quaternions
+from stickslip_sim_core.splines import bspline_matrix, interpolation_matrix
 
 Floats = NDArray[np.float64]
 

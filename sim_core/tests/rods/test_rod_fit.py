@@ -15,7 +15,7 @@ from stickslip_sim_core import (
     solve_rods,
 )
 from stickslip_sim_core.rods.hung_rod import HungRod, HungRodModel, parameters_of
-from stickslip_sim_core.rods.solve import bspline_matrix
+from stickslip_sim_core.splines import bspline_matrix
 
 pytestmark = pytest.mark.physics
 

@@ -6,7 +6,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from stickslip_sim_core.cloth.fabrics import Fabric, custom_fabric, fabric
+from stickslip_sim_core.cloth.fabrics import Fabric, fabric, fabric_of_card
 from stickslip_sim_core.lab.cantilever import BendingLength, cantilever
 from stickslip_sim_core.lab.drape import drape
 from stickslip_sim_core.lab.picture import drape_svg
@@ -30,7 +30,7 @@ def run_test(request: Mapping[str, Any]) -> Answer:
     """
     numbers = request["numbers"]
     name = request["name"]
-    tested = fabric(name) if numbers is None else custom_fabric(name, **numbers)
+    tested = fabric(name) if numbers is None else fabric_of_card(name, numbers)
     return {"test": request["test"], "fabric": name, **TESTS[request["test"]](tested, request)}
 
 

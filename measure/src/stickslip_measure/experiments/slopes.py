@@ -39,6 +39,7 @@ RAMP = (0.9, 1.15)  # tan(alpha) over the value at slip
 RATE = 0.025  # of the ramp [1/s]
 FARTHEST = 0.02  # distance after which the ramp ends [m]
 SLIDING = 0.02  # speed from which on the ramp is compared [m/s]
+LEAST = 0.2  # friction that is searched, over the slope at which the ramp begins
 
 KINETIC = 1.5  # tan(alpha) over mu
 SLIDE = 0.5  # s
@@ -176,8 +177,14 @@ def friction_of_ramp(slopes: Floats, frame: float, moved: Floats) -> float:
         distance = distances(slopes, frame, friction)
         return float(((distance[2:] - distance[:-2]) / (2.0 * frame))[sliding].mean())
 
-    low = 0.2 * float(slopes[0])
+    low = LEAST * float(slopes[0])
     high = float(slopes[-1])
+    # A patch that slides before the ramp has a speed that no friction explains.
+    if ideal(low) < target:
+        raise NoValueError(
+            f"it slides by {1e3 * moved[-1]:.3g} mm, and already below {slopes[0]:.3g}, where the "
+            "slope begins to grow"
+        )
     # The speed falls as friction grows.
     for _ in range(60):
         middle = 0.5 * (low + high)

@@ -7,7 +7,6 @@ many. Each of the three ends as a card with a name, so no other module knows whe
 import math
 import random
 from collections.abc import Mapping, Sequence
-from functools import cache
 from statistics import NormalDist
 from typing import Annotated, Any, Literal, Never, Self, TypeVar, get_args
 
@@ -26,6 +25,7 @@ from pydantic_core.core_schema import ErrorType
 
 from stickslip_schemas.base import WHOLE, Document, Float, content_key
 from stickslip_schemas.spec.axes import Seed, Shorthand, long_form
+from stickslip_schemas.spec.measured import measured_draw, measured_softening
 from stickslip_schemas.spec.names import Material
 from stickslip_schemas.spec.reality import measured_fabrics
 
@@ -51,6 +51,13 @@ RATIO_MAX = 50.0
 Of 618 measured fabrics, four standard deviations are within 12 to 1 and 28 to 1. A number in mN m
 beside one in N m has a ratio of about 1,000.
 """
+SOFTENING_BOUNDS = (50.0, 1e5)
+"""Bounds of the curvature by which bending softens [1/m].
+
+Below, the bound is reached at radii of centimetres; above, nothing softens that a mesh resolves.
+"""
+PER_CENTIMETRE, PER_MILLIMETRE = 100.0, 1000.0
+"""Over 1/m."""
 LEAST_TWIST = 0.1
 """Least rigidity of twist, over the smaller of the other two: it must be positive, and the
 difference of measured numbers may not be."""
@@ -154,6 +161,13 @@ class FabricNumbers(Document):
     damping: Float = Field(
         default=0.0, ge=0, le=10, description="damping force over momentum [1/s]"
     )
+    softening: Float | None = Field(
+        default=None,
+        exclude_if=lambda softening: softening is None,
+        description="curvature D0/|b| [1/m] by which bending softens, M = (D0 - |b| k) k for "
+        "curvatures k up to half of it, and D0 k/2 beyond; measured fabrics have 160 to 1,090. "
+        "Null: the rigidity is constant",
+    )
     source: str | None = Field(
         default=None,
         max_length=500,
@@ -167,9 +181,7 @@ class FabricNumbers(Document):
         """Return a card with rigidities in N m, whatever form and unit they have."""
         if not isinstance(card, dict):
             return card
-        if "softening" in card:
-            rule = "must be left out: the solver bends with a constant rigidity"
-            _refuse(cls.__name__, ("softening",), rule, card["softening"])
+        _check_softening(card.get("softening"))
         stated = card.get("bending")
         density = card.get("density")
         if not isinstance(stated, dict):
@@ -230,6 +242,26 @@ class FabricNumbers(Document):
             return "isotropic"
         length = bending_length(math.sqrt(rigidity[0] * rigidity[1]), self.density)
         return f"bending length {1e3 * length:.1g} mm"
+
+
+def _check_softening(softening: Any) -> None:
+    """Raise ValidationError for a curvature of softening that no cloth has, or of another unit."""
+    # Wrong types, and what is not finite, have errors of their own.
+    is_number = isinstance(softening, int | float) and not isinstance(softening, bool)
+    if not (is_number and math.isfinite(softening)):
+        return
+    low, high = SOFTENING_BOUNDS
+    if low <= softening <= high:
+        return
+    hint = ""
+    if softening < 0:
+        hint = "; give D0 over the size of b: a negative b softens"
+    elif low <= softening * PER_CENTIMETRE <= high:
+        hint = "; is it in 1/cm?"
+    elif low <= softening * PER_MILLIMETRE <= high:
+        hint = "; is it in 1/mm?"
+    rule = f"must be from {low:g} to {high:g} 1/m{hint}"
+    _refuse("FabricNumbers", ("softening",), rule, softening)
 
 
 def _check_table(table: Sequence[tuple[float, float, float, float]]) -> None:
@@ -337,17 +369,6 @@ DRAWN_MAX = 2_000
 TRIES_MAX = 100
 """Draws for each fabric: so many that none is one of cloth mean wrong ranges."""
 
-MEASURED_MEAN = (-0.777, -4.901, -5.077, -4.998)
-MEASURED_DEVIATION = (0.350, 0.611, 0.543, 0.561)
-MEASURED_CORRELATION = (
-    (1.0, 0.717, 0.717, 0.758),
-    (0.717, 1.0, 0.855, 0.900),
-    (0.717, 0.855, 1.0, 0.868),
-    (0.758, 0.900, 0.868, 1.0),
-)
-"""Statistics of 618 fabrics [Feng et al. 2022]: of log10 of the mass per area [kg/m^2], and of the
-rigidities along the warp, along the weft and at 45 degrees [N m]."""
-
 Range = tuple[Positive, Positive]
 
 
@@ -359,10 +380,16 @@ class FabricRanges(Document):
     weft: Range = Field(description="rigidity along the weft, low and high")
     diagonal: Range = Field(description="rigidity at 45 degrees to both, low and high")
     unit: Unit = Field(description="unit of the rigidities")
+    softening: Range | None = Field(
+        default=None,
+        description="curvature by which bending softens, low and high [1/m]; null: none softens",
+    )
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
-        for name in ("density", "warp", "weft", "diagonal"):
+        for name in ("density", "warp", "weft", "diagonal", "softening"):
+            if getattr(self, name) is None:
+                continue
             low, high = getattr(self, name)
             if not low <= high:
                 rule = f"must be [low, high], low at most high, and it is {[low, high]}"
@@ -409,6 +436,8 @@ class FabricDistribution(Document):
             ValidationError: Too few draws are of cloth.
         """
         stream = random.Random(self.seed)
+        # It has a stream of its own, since nothing is known of how it goes with the other numbers.
+        of_softening = random.Random(f"softening {self.seed}")
         cards: dict[str, dict[str, Any]] = {}
         for number in range(self.num):
             card = self._drawn_card(stream)
@@ -420,6 +449,9 @@ class FabricDistribution(Document):
                 )
                 value = self.model_dump(mode="json")["distribution"]
                 _refuse(type(self).__name__, ("distribution",), rule, value)
+            softening = self._softening(_within(of_softening.random()))
+            if softening is not None:
+                card["softening"] = softening
             cards[f"{self._word}-{self.seed}-{number}"] = card
         return cards
 
@@ -433,7 +465,7 @@ class FabricDistribution(Document):
             if isinstance(self.distribution, FabricRanges):
                 drawn = self.distribution.draw(normals)
             else:
-                drawn = _measured_draw(normals)
+                drawn = measured_draw(normals)
             density, warp, weft, diagonal = (_rounded(number) for number in drawn)
             if 0.01 <= density <= 5.0 and is_of_cloth(density, warp, weft):
                 twist = _rounded(twist_of(warp, weft, diagonal))
@@ -444,6 +476,15 @@ class FabricDistribution(Document):
                     "source": f"drawn from {self._word}, seed {self.seed}",
                 }
         return None
+
+    def _softening(self, share: float) -> float | None:
+        """Return the curvature of softening [1/m] for a share of (0, 1), or None."""
+        if not isinstance(self.distribution, FabricRanges):
+            return _rounded(measured_softening(share))
+        if self.distribution.softening is None:
+            return None
+        low, high = self.distribution.softening
+        return _rounded(low * (high / low) ** share)
 
 
 def _within(share: float) -> float:
@@ -458,32 +499,6 @@ def is_of_cloth(density: float, warp: float, weft: float) -> bool:
     return all(low <= length <= high for length in lengths) and (
         1.0 / RATIO_MAX <= warp / weft <= RATIO_MAX
     )
-
-
-def _measured_draw(normals: Sequence[float]) -> tuple[float, float, float, float]:
-    """Return density, warp, weft and diagonal of one draw of the 618 fabrics [SI].
-
-    x = mean + sd L n, with the Cholesky factor L of the correlations and normal numbers n.
-    """
-    factor = _cholesky()
-    drawn = []
-    for mean, deviation, row in zip(MEASURED_MEAN, MEASURED_DEVIATION, factor, strict=True):
-        correlated = sum(weight * normal for weight, normal in zip(row, normals, strict=True))
-        drawn.append(10.0 ** (mean + deviation * correlated))
-    density, warp, weft, diagonal = drawn
-    return density, warp, weft, diagonal
-
-
-@cache
-def _cholesky() -> tuple[tuple[float, ...], ...]:
-    """Return the lower Cholesky factor of the correlations: (4, 4)."""
-    size = len(MEASURED_CORRELATION)
-    factor = [[0.0] * size for _ in range(size)]
-    for i in range(size):
-        for j in range(i + 1):
-            rest = MEASURED_CORRELATION[i][j] - sum(factor[i][k] * factor[j][k] for k in range(j))
-            factor[i][j] = math.sqrt(rest) if i == j else rest / factor[j][j]
-    return tuple(tuple(row) for row in factor)
 
 
 class _FabricShorthand(Shorthand):

@@ -1,7 +1,8 @@
 """Fabrics: density, stretching stiffness and bending stiffness."""
 
 import tomllib
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib.resources import files
 from typing import Any
@@ -19,6 +20,9 @@ STRETCHING_MAX = 1e7
 
 RIGIDITY_BOUNDS = (1e-12, 10.0)
 """Bounds of the eigenvalues of the bending stiffness [N m]."""
+
+SOFTENING_BOUNDS = (20.0, 1e6)
+"""Bounds of the curvature of softening [1/m]. 618 fabrics have 160 to 1,090 [Feng et al. 2022]."""
 
 DAMPING_MAX = 1e3
 """Largest damping [1/s]."""
@@ -53,9 +57,20 @@ class Fabric:
     damping: float = 0.0
     """Damping proportional to mass [1/s]: a free motion slows down by exp(-damping t)."""
 
+    softening: float | None = None
+    """Curvature k_s = D/|b| [1/m] with which bending softens; None: the stiffness is constant.
+
+    The moment is M = (D - |b| k) k up to k_s/2, and D k/2 beyond, where it would begin to fall. In
+    a plate k is the curvature of the energy, k^2 = H:D:H / sqrt(D11 D22): the law is that of the
+    curvature k along the warp and the weft if both are equally stiff, and the stiffer of the two
+    softens at a smaller curvature.
+    """
+
     def __post_init__(self) -> None:
         check_range("density", self.density, *DENSITY_BOUNDS)
         check_range("damping", self.damping, 0.0, DAMPING_MAX)
+        if self.softening is not None:
+            check_range("softening", self.softening, *SOFTENING_BOUNDS)
         k, d = np.asarray(self.stretching, float), np.asarray(self.rigidity, float)
         if k.shape != (6, 4) or not ((k >= 0.0) & (k <= STRETCHING_MAX)).all():
             raise ValueError(
@@ -107,6 +122,7 @@ class Fabric:
             self.stretching * stretching,
             self.rigidity * bending,
             self.damping,
+            self.softening,
         )
 
 
@@ -172,6 +188,17 @@ def custom_fabric(
         numbers = np.asarray(bending, float)
         rigidity = np.diag(numbers) if numbers.shape == (3,) else numbers
     return Fabric(name, float(density), table, rigidity, float(damping))
+
+
+def fabric_of_card(name: str, card: Mapping[str, Any]) -> Fabric:
+    """Return a fabric from the numbers of its card: `custom_fabric`, and its softening.
+
+    Raises:
+        ValueError: A number breaks its rule, is missing, or excludes another.
+    """
+    numbers = dict(card)
+    softening = numbers.pop("softening", None)
+    return replace(custom_fabric(name, **numbers), softening=softening)
 
 
 def isotropic(

@@ -135,7 +135,13 @@ class Cloth:
             mesh.rest,
             mesh.triangles,
             [
-                (fabric.density, fabric.stretching, fabric.rigidity, fabric.damping)
+                (
+                    fabric.density,
+                    fabric.stretching,
+                    fabric.rigidity,
+                    fabric.damping,
+                    fabric.softening or 0.0,
+                )
                 for fabric in self.fabrics
             ],
             tolerance=preset.tolerance * self.force_scale,

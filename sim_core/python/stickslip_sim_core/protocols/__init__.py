@@ -27,6 +27,7 @@ from stickslip_sim_core.protocols.rods import (
     RodLateralBuckling,
     RodProtocol,
 )
+from stickslip_sim_core.protocols.soft_cantilever import SoftCantilever
 from stickslip_sim_core.protocols.static_friction import KineticSlide, StaticOnset
 from stickslip_sim_core.protocols.stick_slip import StickSlip
 
@@ -39,6 +40,7 @@ PROTOCOLS: Mapping[str, type[Protocol]] = MappingProxyType(
             RodLateralBuckling,
             StickSlip,
             Cantilever,
+            SoftCantilever,
             LateralBuckling,
             InclinedPlane,
             StackedIncline,
@@ -90,6 +92,7 @@ QUICK: Mapping[str, Mapping[str, Any]] = {
     "lateral-buckling": {"aspect": (0.2,), "poisson": (0.3,)},
     "stick-slip": {"friction": (0.1, 0.3), "phases": False},
     "cantilever": {"gamma": (1.0, 100.0), "unstructured": 1},
+    "soft-cantilever": {"gamma": (10.0,), "softening": (16.0,), "unstructured": 0},
     "capstan": {"friction": (0.3,), "bending": (0.05,)},
     "heavy-fold": {"friction": (0.3,), "cells": 80},
     "stacked-incline": {"friction": (0.3,), "sheets": (2,), "unstructured": 0},
@@ -137,6 +140,7 @@ _CLOTH = (
     "lateral-buckling",
     "stick-slip",
     "cantilever",
+    "soft-cantilever",
 )
 SCENE_PROTOCOLS = (
     *_CLOTH,

@@ -84,17 +84,22 @@ def finer(gamma: float) -> int:
 
 
 def hang(
-    clamped: Strip, gamma: float, preset: SolverSettings, stretching: float = STRETCHING
+    clamped: Strip,
+    gamma: float,
+    preset: SolverSettings,
+    stretching: float = STRETCHING,
+    softening: float | None = None,
 ) -> tuple[float, Cloth]:
     """Let a strip that starts straight and horizontal settle, and return H/W and the cloth.
 
-    H/W is NaN if the strip did not come to rest. The scheme of time has no part in the answer, so
-    it is always the one of first order, which long steps damp.
+    H/W is NaN if the strip did not come to rest. For `softening` see `Fabric`. The scheme of time
+    has no part in the answer, so it is always the one of first order, which long steps damp.
     """
     weight = DENSITY * GRAVITY * LENGTH  # N/m
+    laid = isotropic(DENSITY, stretching * weight, weight * LENGTH**2 / gamma)
     cloth = Cloth(
         clamped.mesh,
-        isotropic(DENSITY, stretching * weight, weight * LENGTH**2 / gamma),
+        replace(laid, softening=softening),
         replace(preset, second_order=False),
         held=clamped.held,
         force_scale=FORCE_SHARE / finer(gamma) * DENSITY * GRAVITY * RESIDUAL_PATCH,

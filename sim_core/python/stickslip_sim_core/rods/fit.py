@@ -24,10 +24,10 @@ from stickslip_sim_core.rods.solve import (
     STIFFNESS,
     Bools,
     RodSolution,
-    bspline_matrix,
     finite_array,
     solve_general_rods,
 )
+from stickslip_sim_core.splines import bspline_matrix
 
 CANDIDATES = 4
 """Number of rods of the library from which a fit starts."""

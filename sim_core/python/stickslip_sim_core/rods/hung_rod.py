@@ -16,13 +16,12 @@ from stickslip_sim_core.rods.solve import (
     CLAMP_FRAME,
     ELEMENT_TURN_MAX,
     RodSolution,
-    bspline_matrix,
     clamp_quaternions,
     finite_array,
-    interpolation_matrix,
     rod_stiffness,
     solve_general_rods,
 )
+from stickslip_sim_core.splines import bspline_matrix, interpolation_matrix
 
 ELEMENTS_MIN = 96
 """Least number of elements of the coarser chain."""

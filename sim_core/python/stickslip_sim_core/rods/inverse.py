@@ -12,9 +12,10 @@ from stickslip_sim_core.rods.solve import (
     STIFFNESS,
     clamp_quaternions,
     finite_array,
-    interpolation_matrix,
     rod_stiffness,
 )
+from stickslip_sim_core.rotations import matrices_of_quaternions
+from stickslip_sim_core.splines import interpolation_matrix
 
 GRAVITY = np.array([0.0, 0.0, -1.0])
 
@@ -136,12 +137,8 @@ def integrate_frames(curvature: Floats, clamp_frame: ArrayLike = CLAMP_FRAME) ->
         _sim_core.chain_frames(rod / h, clamp)[::2]
         for rod, clamp in zip(theta, clamps, strict=True)
     ]
-    # Imported here, so that importing the package stays quick.
-    from scipy.spatial.transform import Rotation
-
-    # scipy has the scalar part last, and the core has it first.
-    quaternions = np.roll(np.reshape(frames, (-1, 4)), -1, axis=1)
-    return np.asarray(Rotation.from_quat(quaternions).as_matrix()).reshape(n, points, 3, 3)
+    quaternions = np.reshape(frames, (-1, 4))
+    return matrices_of_quaternions(quaternions).reshape(n, points, 3, 3)
 
 
 def _flattened(field: ArrayLike, leading: tuple[int, ...], rank: int) -> Floats:

@@ -5,18 +5,14 @@ along their length.
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stickslip_sim_core import _sim_core
 from stickslip_sim_core.arrays import Floats
-
-if TYPE_CHECKING:
-    from scipy.interpolate import BSpline
-
+from stickslip_sim_core.rotations import quaternions_of_matrices
+from stickslip_sim_core.splines import interpolation_matrix
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int32]
@@ -273,40 +269,4 @@ def clamp_quaternions(clamp_frame: ArrayLike, n: int) -> Floats:
         raise ValueError(
             f"clamp_frame: must be a rotation, got R^T R - 1 = {error:.1e}, det {determinant:.3g}"
         )
-    # Imported here, so that importing the package stays quick.
-    from scipy.spatial.transform import Rotation
-
-    # scipy has the scalar part last. Without rods there is nothing to convert.
-    return (
-        np.ascontiguousarray(np.roll(Rotation.from_matrix(R).as_quat(), 1, axis=1))
-        if n
-        else np.empty((0, 4))
-    )
-
-
-def bspline_matrix(intervals: int, s: Floats) -> Floats:
-    """Return the cubic B-splines on equal intervals at s (p,), shape (p, intervals + 3)."""
-    # Imported here, so that importing the package stays quick.
-    from scipy.interpolate import BSpline
-
-    knots = np.arange(-3.0, intervals + 4.0) / intervals
-    return np.asarray(BSpline.design_matrix(s, knots, 3, extrapolate=True).toarray())
-
-
-@lru_cache(maxsize=64)
-def _interpolants(samples: int, derivative: int) -> "BSpline":
-    from scipy.interpolate import make_interp_spline
-
-    s = np.linspace(0.0, 1.0, samples)
-    return make_interp_spline(s, np.eye(samples), k=min(3, samples - 1)).derivative(derivative)
-
-
-def interpolation_matrix(samples: int, s: Floats, derivative: int = 0) -> Floats:
-    """Return the matrix (p, samples) that interpolates values at uniform arc length at s (p,).
-
-    Four samples or more give the cubic spline with not-a-knot ends. Three samples give a parabola,
-    two a line, and one a constant.
-    """
-    if samples == 1:
-        return np.full((len(s), 1), 0.0 if derivative else 1.0)
-    return np.asarray(_interpolants(samples, derivative)(s))
+    return quaternions_of_matrices(R)

@@ -1,5 +1,6 @@
 """A fit of a rod together with the tilt of its clamp, for clamps that nobody has measured."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -141,22 +142,34 @@ class _Search:
                     best_tilt, best, least = tilt, state, residual
         if best is None:
             raise RuntimeError("no rod near the centreline hangs in a stable equilibrium")
-        # scipy is slow to import, and few callers fit a tilt.
-        from scipy.optimize import minimize_scalar
-
         # The minimum is within a step of the best tilt.
-        refined = minimize_scalar(
-            self.cost,
-            args=(best,),
-            bounds=(best_tilt - TILT_STEP, best_tilt + TILT_STEP),
-            method="bounded",
-            options={"xatol": TILT_TOLERANCE},
+        tilt = _place_of_minimum(
+            lambda angle: self.cost(angle, best), best_tilt - TILT_STEP, best_tilt + TILT_STEP
         )
-        tilt = float(refined.x)
         state = self.rod(tilt, best)
         if state is None or root_mean_square(state.residual(self.data)) > least:
             return best_tilt, best
         return tilt, state
+
+
+def _place_of_minimum(cost: Callable[[float], float], low: float, high: float) -> float:
+    """Return where a function is least between two places, to `TILT_TOLERANCE` [Kiefer 1953].
+
+    Golden section search: one of two inner places is used again in the next interval.
+    """
+    ratio = 0.5 * (np.sqrt(5.0) - 1.0)
+    inner = [high - ratio * (high - low), low + ratio * (high - low)]
+    costs = [cost(inner[0]), cost(inner[1])]
+    while high - low > TILT_TOLERANCE:
+        if costs[0] < costs[1]:
+            high = inner[1]
+            inner = [high - ratio * (high - low), inner[0]]
+            costs = [cost(inner[0]), costs[0]]
+        else:
+            low = inner[0]
+            inner = [inner[1], low + ratio * (high - low)]
+            costs = [costs[1], cost(inner[1])]
+    return float(0.5 * (low + high))
 
 
 def _tilted_fit(search: _Search, tilt: float, state: HungRod) -> TiltedFit:

@@ -183,6 +183,8 @@ class Comparison:
     def _factors(self, low: Fabric, high: Fabric) -> dict[FabricProperty, float]:
         if low.damping != high.damping:
             self._refuse("the damping of a fabric")
+        if low.softening != high.softening:
+            self._refuse("the softening of a fabric")
         return {
             "density": high.density / low.density,
             "bending": self._factor(low.rigidity, high.rigidity, "bending"),

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.rotations import matrices_of_vectors
+from stickslip_sim_core.splines import hermite, monotone_slopes
 
 RIGHT_ANGLE = 1e-12
 """Tolerance within which the entries of a rotation matrix are rounded to -1, 0 and 1.
@@ -37,14 +39,10 @@ def _through(times: Floats, values: Floats, slopes: Floats) -> Callable[[ArrayLi
 
     It is constant before the first and after the last time.
     """
-    # Imported here, so that importing the package stays quick.
-    from scipy.interpolate import CubicHermiteSpline
-
     # A spline needs two times. The copy keeps callers from writing into `values`.
     if len(times) == 1:
         return lambda time: np.array(np.broadcast_to(values[0], np.shape(time) + values.shape[1:]))
-    path = CubicHermiteSpline(times, values, slopes)
-    return lambda time: np.asarray(path(np.clip(time, times[0], times[-1])))
+    return lambda time: hermite(times, values, slopes, np.clip(time, times[0], times[-1]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,12 +179,10 @@ def _monotone(times: Floats, values: Floats) -> Floats:
 
     A slope is 0 at both ends, and at a keyframe from which a value turns back.
     """
-    from scipy.interpolate import PchipInterpolator
-
-    # scipy's own slopes at the ends are not 0, and the motion would start with a jump of speed.
+    # With other slopes at the ends, the motion would start with a jump of speed.
     slopes = np.zeros_like(values)
     if len(times) > 2:
-        slopes[1:-1] = PchipInterpolator(times, values).derivative()(times[1:-1])
+        slopes[1:-1] = monotone_slopes(times, values)
     return slopes
 
 
@@ -195,11 +191,8 @@ def rotation(turn: ArrayLike) -> Floats:
 
     Right angles are exact.
     """
-    from scipy.spatial.transform import Rotation
-
-    # scipy takes a single list of rotation vectors.
     vectors = np.asarray(turn, float)
-    matrices = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(*vectors.shape, 3)
+    matrices = matrices_of_vectors(vectors.reshape(-1, 3)).reshape(*vectors.shape, 3)
     # A matrix with one oblique entry stays as it is: rounding a part of it would leave no rotation.
     # Adding 0.0 turns -0.0 into 0.0.
     whole = np.rint(matrices)

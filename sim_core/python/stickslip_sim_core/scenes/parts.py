@@ -23,7 +23,7 @@ from stickslip_sim_core.cloth.contact import (
     plane,
     sphere,
 )
-from stickslip_sim_core.cloth.fabrics import Fabric, custom_fabric, fabric
+from stickslip_sim_core.cloth.fabrics import Fabric, fabric, fabric_of_card
 from stickslip_sim_core.scenes.holders import ALWAYS, Hang, Holder, Hung, hung
 from stickslip_sim_core.scenes.motions import Keyframes, MovingMesh, RigidMotion, Spin, rotation
 
@@ -86,7 +86,7 @@ def sheet(
     cloth_fabric = (
         fabric(document["material"])
         if custom is None
-        else custom_fabric(document["material"], **custom)
+        else fabric_of_card(document["material"], custom)
     )
     cloth_fabric = cloth_fabric.scaled(**document["factors"])
     turn = rotation(document["turn"])

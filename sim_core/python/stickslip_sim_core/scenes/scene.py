@@ -11,7 +11,7 @@ from stickslip_sim_core._sim_core import build_info
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import checks
 from stickslip_sim_core.cloth.contact import Body, SelfContact, Surface
-from stickslip_sim_core.cloth.fabrics import Fabric, custom_fabric, fabric
+from stickslip_sim_core.cloth.fabrics import Fabric, fabric, fabric_of_card
 from stickslip_sim_core.cloth.meshes import Mesh
 from stickslip_sim_core.cloth.presets import SolverSettings
 from stickslip_sim_core.cloth.solver import Cloth
@@ -384,5 +384,5 @@ def _of_materials(physics: Mapping[str, Any]) -> dict[str, Any]:
     known = dict(physics)
     name = known.pop("material")
     numbers = known.pop("fabric", None)
-    made = fabric(name) if numbers is None else custom_fabric(name, **numbers)
+    made = fabric(name) if numbers is None else fabric_of_card(name, numbers)
     return {**known, "material": made}

@@ -44,6 +44,36 @@ inline Stiffening stiffening_of(double s) {
   return {value / s, slope, (second - 2.0 * slope) / s};
 }
 
+// Rigidity that falls with curvature: M = (D - |b| k) k, as measured of cloth [Feng et al. 2022],
+// but not below `softest` D k, where M would begin to fall. With k_s = D/|b| the energy per area is
+// D k^2/2 psi, and in terms of e = D k^2 it is G(e)/2:
+//
+//     G' = 1 - k/k_s,   G'' = -1/(2 D k_s k)    up to k = (1 - softest) k_s
+//     G' = softest,     G'' = 0                 beyond
+//
+// For a plate k is that of the energy, e = H:D:H with the mean rigidity D of warp and weft: the
+// energy is then convex in H, as long as G' is at least 1/2.
+struct Softened {
+  double value, slope, curvature;  // G, dG/de, d2G/de2
+};
+
+constexpr double softest = 0.5;
+
+// Curvature over k_s below which nothing has softened, and above which it counts in the matrix.
+constexpr double soft_from = 1e-9, soft_counts = 0.02;
+
+inline Softened softened_of(const SofteningData& fabric, double e) {
+  const double share = __builtin_sqrt(e / fabric.rigidity) / fabric.curvature;  // k/k_s
+  const double end = 1.0 - softest;
+  if (share < soft_from) return {e, 1.0, 0.0};
+  if (share < end) {
+    return {e * (1.0 - 2.0 / 3.0 * share), 1.0 - share, -0.5 * share / e};
+  }
+  const double unit = fabric.rigidity * fabric.curvature * fabric.curvature;
+  const double value_at_end = unit * end * end * (1.0 - 2.0 / 3.0 * end);
+  return {value_at_end + softest * (e - unit * end * end), softest, 0.0};
+}
+
 inline int store_fold(FoldData* folds, int entry, int node, NodeD a, NodeD b) {
   folds->nodes[entry] = node;
   float* to = folds->vectors + 8L * entry;
@@ -61,7 +91,8 @@ inline int store_fold(FoldData* folds, int entry, int node, NodeD a, NodeD b) {
 //     W'' = A (r D + q r' h^2 N) + A (2 q r'' h^4 n n^T + 2 r' h^2 (n m^T + m n^T))
 //
 // The first part of W'' acts on x, y and z alike and goes into the matrix (`stiffening`), the
-// second into `folds`.
+// second into `folds`. Where rigidity falls with curvature, W = A/2 G(r q): derivatives are those
+// above times G', and W'' has 2 A G'' (r m + q r' h^2 n) (r m + q r' h^2 n)^T besides.
 double bending(const BendingData& data, const double* x, double* gradient, float* stiffening,
                FoldData* folds) {
   int entries = 0;
@@ -83,8 +114,20 @@ double bending(const BendingData& data, const double* x, double* gradient, float
     const NodeD m2 = spread(d[2]) * h0 + spread(d[4]) * h1 + spread(d[5]) * h2;
     const double q = dot3(m0, h0) + dot3(m1, h1) + dot3(m2, h2);
     const double s = data.spacing2[t] * (dot3(h0, h0) + dot3(h1, h1) + 0.5 * dot3(h2, h2));
-    const Stiffening fold = stiffening_of(s);
-    const double area = data.area[t], turn = q * fold.slope * data.spacing2[t];
+    Stiffening fold = stiffening_of(s);
+    const SofteningData& fabric = data.softening[data.fabric[t]];
+    const double area = data.area[t];
+    // What softening adds to W'': across (r m + q r' h^2 n), which is `ratio` b + `along` a.
+    double across = 0.0, ratio = 0.0, along = 0.0;
+    if (fabric.curvature > 0.0) {
+      const Softened soft = softened_of(fabric, fold.ratio * q);
+      ratio = fold.ratio;
+      along = q * fold.slope * data.spacing2[t];
+      across = 2.0 * area * soft.curvature;
+      energy += 0.5 * area * (soft.value - soft.slope * ratio * q);
+      fold = {soft.slope * fold.ratio, soft.slope * fold.slope, soft.slope * fold.curvature};
+    }
+    const double turn = q * fold.slope * data.spacing2[t];
     energy += 0.5 * area * fold.ratio * q;
     if (stiffening) {
       stiffening[2L * t] = float(fold.ratio);
@@ -97,11 +140,19 @@ double bending(const BendingData& data, const double* x, double* gradient, float
       const double* w = data.weights + 4L * i;
       *at += spread(w[0]) * p0 + spread(w[1]) * p1 + spread(w[2]) * p2;
     }
-    if (folds && s > folds->smallest) {
+    // This is A k/k_s.
+    const bool softens = -across * ratio * q > soft_counts * area;
+    if (folds && (s > folds->smallest || softens)) {
       const double size2 = data.spacing2[t];
-      float* coefficients = folds->coefficients + 2L * folds->count;
+      float* coefficients = folds->coefficients + 3L * folds->count;
       coefficients[0] = float(2.0 * area * q * fold.curvature * size2 * size2);
       coefficients[1] = float(2.0 * area * fold.slope * size2);
+      coefficients[2] = 0.0f;
+      if (across != 0.0) {
+        coefficients[0] += float(across * along * along);
+        coefficients[1] += float(across * ratio * along);
+        coefficients[2] = float(across * ratio * ratio);
+      }
       folds->begin[folds->count++] = entries;
       for (int i = begin; i < end; ++i) {
         if (data.nodes[i] >= folds->free_nodes) continue;

@@ -17,8 +17,9 @@ inline void add_folds(const FoldData& folds, const Node* in, Node* out) {
       along_b += vectors[2L * e + 1] * v;
     }
     const float a = along_a[0] + along_a[1] + along_a[2], b = along_b[0] + along_b[1] + along_b[2];
-    const float aa = folds.coefficients[2L * f], ab = folds.coefficients[2L * f + 1];
-    const Node to_a = spread(aa * a + ab * b), to_b = spread(ab * a);
+    const float* coefficients = folds.coefficients + 3L * f;
+    const float aa = coefficients[0], ab = coefficients[1], bb = coefficients[2];
+    const Node to_a = spread(aa * a + ab * b), to_b = spread(ab * a + bb * b);
     for (int e = folds.begin[f]; e < folds.begin[f + 1]; ++e) {
       out[folds.nodes[e]] += to_a * vectors[2L * e] + to_b * vectors[2L * e + 1];
     }

@@ -1,0 +1,85 @@
+"""The adapters that come with the package: pinned, short, and right where a simulator is installed.
+
+`STICKSLIP_MEASURE_ENVIRONMENTS` names a folder with an environment for each adapter, such as
+`FOLDER/mujoco/bin/python`. Without it, the tests that run a simulator are skipped.
+"""
+
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from stickslip_measure import adapters
+from stickslip_measure.campaign import Cell, Request, measure
+from stickslip_measure.cli import adapter_names
+from stickslip_measure.contract import Floats, Sheet
+from stickslip_measure.process import Program
+from stickslip_sim_core.cloth import meshes
+
+FOLDER = Path(adapters.__file__).parent
+FOREIGN = [name for name in adapter_names() if name != "stickslip"]
+ENVIRONMENTS = os.environ.get("STICKSLIP_MEASURE_ENVIRONMENTS")
+
+LONGEST = 90
+"""Most lines of an adapter that are not empty."""
+
+CHEAPEST = {"elastica": "hanging-rod"}
+"""The experiment of each adapter that costs least, if it is not the sliding patch."""
+
+
+@pytest.mark.parametrize("path", sorted(FOLDER.glob("*.py")), ids=lambda path: path.stem)
+def test_an_adapter_is_short(path: Path) -> None:
+    lines = [line for line in path.read_text().splitlines() if line.strip()]
+    assert len(lines) <= LONGEST
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_requirements_are_pinned(name: str) -> None:
+    lines = (FOLDER / f"{name}.requirements.txt").read_text().splitlines()
+    pins = [line for line in lines if line and not line.startswith("#")]
+    assert pins
+    assert all(re.fullmatch(r"[a-z-]+==[0-9.]+", pin) for pin in pins)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FOREIGN)
+def test_the_cheapest_experiment_runs(name: str, tmp_path: Path) -> None:
+    if ENVIRONMENTS is None:
+        pytest.skip("STICKSLIP_MEASURE_ENVIRONMENTS names no folder of environments")
+    python = Path(ENVIRONMENTS) / name / "bin" / "python"
+    if not python.exists():
+        pytest.skip(f"{name} is not installed: {python} does not exist")
+    cells: list[Cell] = []
+    experiment = CHEAPEST.get(name, "kinetic-friction")
+    program = Program(FOLDER / f"{name}.py", str(python))
+    measure(Request(program, tmp_path, (experiment,), ("default",)), cells.append)
+    results = [cell for cell in cells if cell.experiment == experiment]
+    states = {cell.state for cell in results}
+    # Right or wrong, the adapter sets the scene up and steps.
+    assert states <= {"measured", "no value", "sleeps"}, [cell.reason for cell in results]
+
+
+MESH = meshes.grid(0.1, 0.1, 4, 4)
+FLAT = np.column_stack([MESH.rest, np.zeros(len(MESH.rest))])
+
+
+def sheet(start: Floats) -> Sheet:
+    """Return a scene with one sheet of 0.1 x 0.1 m."""
+    numbers = np.zeros(len(start), dtype=np.int32)
+    return Sheet(MESH.rest, start, MESH.triangles, numbers, 0.025, 0.2, 100.0, 1e-5)
+
+
+def test_a_sheet_that_is_moved_is_not_curved() -> None:
+    turn = np.array([[0.0, -0.6, 0.8], [1.0, 0.0, 0.0], [0.0, 0.8, 0.6]])
+    assert not sheet(FLAT @ turn.T + 0.3).is_curved()
+    bent = FLAT.copy()
+    bent[0, 2] += 1e-3
+    assert sheet(bent).is_curved()
+
+
+def test_masses_are_thirds_of_triangles() -> None:
+    masses = sheet(FLAT).masses()
+    assert masses.sum() == pytest.approx(0.2 * 0.1**2)
+    # A vertex at an edge has two triangles, and an inner one up to eight.
+    assert masses.max() == pytest.approx(4.0 * masses.min())
