@@ -12,6 +12,7 @@ from stickslip_services.queue.background import services, start, sweep
 from stickslip_services.queue.context import Context
 from stickslip_services.queue.control import cancel_job
 from stickslip_services.queue.leaving import QueueCleaner
+from stickslip_services.queue.planner import Planner
 from stickslip_services.queue.submit import submit_job
 from stickslip_services.settings import Settings
 from stickslip_testing.invariants import violations
@@ -70,6 +71,25 @@ def test_a_cancelled_job_leaves_in_pieces_and_others_stay(
 def _pieces_of(count: int) -> list[int]:
     full, rest = divmod(count, PIECE)
     return [PIECE] * full + ([rest] if rest else [])
+
+
+def test_renders_leave_that_were_planned_before_the_last_simulations(
+    settings: Settings, clock: ManualClock
+) -> None:
+    """Stages are removed one after the other, and pieces of a plan mix their numbers."""
+    context = Context.open(settings.model_copy(update={"plan_samples": 4}), clock)
+    start(context)
+    worker = PretendWorker(DirectApi(context), context.store).register()
+    job = submit(context, gamma=(1.0, 2.0, 3.0))
+    Planner(context).run()
+    worker.finish(*worker.lease(simulate=2))
+    assert set(queued(context, job)) == {Stage.simulate, Stage.render}
+    assert cancel_job(context, job).state is JobState.cancelled
+    cleaner = QueueCleaner(context, piece=PIECE)
+    while cleaner.step():
+        pass
+    assert queued(context, job) == {}
+    context.close()
 
 
 def test_a_job_that_waits_for_workers_stays_until_it_is_cancelled(

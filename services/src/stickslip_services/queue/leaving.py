@@ -16,7 +16,7 @@ from stickslip_services.database.statements import Statement, ValueQuery
 from stickslip_services.queue.context import Context
 
 PIECE = 1000
-"""Rows of a piece. It takes 4 ms of the write lock; larger pieces cost no less time a row."""
+"""Rows of a piece. It takes 2 ms of CPU; larger pieces cost no less a row."""
 
 REST_SECONDS = 0.02
 """Pause after a piece, in which others write [s]."""
