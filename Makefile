@@ -22,7 +22,7 @@ BENCHMARKS = $(filter-out $(addprefix benchmarks/, render_rod_set.py cloth_conta
 DISTRIBUTIONS = schemas sim_core measure services training workers workers/blender
 CPP_FILES = $(shell find sim_core/src sim_core/tests/core workers/blender/raster -name "*.[ch]pp")
 
-.PHONY: setup setup-dev demo test-fast test test-kernels test-slow test-main test-blender test-without-blender test-core check complexity size density docs bench reality wheels release-wheels release-check constraints clean
+.PHONY: setup setup-dev demo test-fast test test-kernels test-slow test-main test-blender test-slow-main test-slow-blender test-without-blender test-core check complexity size density docs bench reality wheels release-wheels release-check constraints clean
 
 # The environments that `make demo` and the service need. Tests and checks need more: setup-dev.
 setup: .venv/core.stamp .venv-blender/raster.stamp
@@ -107,8 +107,14 @@ test-kernels: setup-dev
 complexity: setup-dev
 	$(PY) tools/complexity.py
 
-test-slow: complexity
+# Slow tests of the service mostly wait, so the others and the complexity of the core run beside them.
+test-slow: setup-dev
+	@$(MAKE) --no-print-directory --jobs=3 --output-sync=target --keep-going test-slow-main test-slow-blender complexity
+
+test-slow-main:
 	$(PYTEST) --numprocesses=$$((2 * $$(nproc))) --timeout=1200 -m slow
+
+test-slow-blender:
 	$(BLENDER_PY) -m pytest --quiet -m slow workers/blender
 
 check: setup-dev

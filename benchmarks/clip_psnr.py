@@ -119,6 +119,7 @@ def compare(view: View, clip: ClipRenderer, options: argparse.Namespace) -> None
                 for frame, light in references[0]
             ],
             mean_weights,
+            options.frames,
         )
         measured = pool_errors(
             [(errors(video[frame], light, channel), weights[frame] > 0.0) for frame, light in long]

@@ -29,7 +29,7 @@ nobody knows. The times themselves are printed; `benchmarks/results/faults.json`
 machines."""
 
 
-def wait_for(what: str, probe: Callable[[], T | None], timeout: float) -> T:
+def wait_for(condition: str, probe: Callable[[], T | None], timeout: float) -> T:
     """Poll `probe` until it returns something.
 
     Fail naming `what` after PATIENCE times `timeout` seconds.
@@ -41,7 +41,7 @@ def wait_for(what: str, probe: Callable[[], T | None], timeout: float) -> T:
         if answer is not None:
             return answer
         time.sleep(0.05)
-    raise AssertionError(f"waited {timeout:g} s in vain for {what}")
+    raise AssertionError(f"waited {timeout:g} s in vain for {condition}")
 
 
 def pids() -> list[int]:
@@ -76,11 +76,11 @@ def descendants(pid: int) -> list[int]:
         except OSError:
             continue
         parents.setdefault(int(stat.rpartition(")")[2].split()[1]), []).append(child)
-    found, heads = [], [pid]
+    children, heads = [], [pid]
     while heads:
         heads = [child for head in heads for child in parents.get(head, [])]
-        found += heads
-    return found
+        children += heads
+    return children
 
 
 class Service:

@@ -69,13 +69,13 @@ def entered(pid: int) -> Iterator[None]:
         if libc.setns(network, CLONE_NEWNET) != 0:
             raise OSError(ctypes.get_errno(), "setns")
 
-    own, other = (os.open(f"/proc/{name}/ns/net", os.O_RDONLY) for name in ("self", pid))
+    home, other = (os.open(f"/proc/{name}/ns/net", os.O_RDONLY) for name in ("self", pid))
     try:
         enter(other)
         yield
     finally:
-        enter(own)
-        os.close(own)
+        enter(home)
+        os.close(home)
         os.close(other)
 
 
@@ -237,7 +237,7 @@ class Lab:
             ).one()
         return int(tries), int(losses)
 
-    def wait(self, what: str, is_so: Callable[[], bool], seconds: float = 240) -> float:
+    def wait(self, condition: str, is_so: Callable[[], bool], seconds: float = 240) -> float:
         """Wait for something while there is work; return how long it took."""
         begin = time.monotonic()
 
@@ -246,7 +246,7 @@ class Lab:
             return True if is_so() else None
 
         try:
-            wait_for(what, probe, seconds)
+            wait_for(condition, probe, seconds)
         except AssertionError as error:
             for log in sorted(self._logs.glob("*.log")):
                 lines = log.read_text(errors="replace").splitlines()[-15:]
@@ -259,7 +259,7 @@ class Lab:
         {}.
         """
         workers: list[dict[str, Any]] = self._http.get("/v1/workers").json()
-        return next((one for one in workers if one["name"] == name and one["alive"]), {})
+        return next((entry for entry in workers if entry["name"] == name and entry["alive"]), {})
 
     def finished(self) -> list[str]:
         """Wait until all jobs are over; return their states."""

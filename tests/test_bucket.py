@@ -53,14 +53,14 @@ def test_a_dataset_is_made_read_and_collected_in_a_bucket(service: Service, tmp_
     )
     service.stop()  # the bucket is read without anything of ours
     version = obstore.store.S3Store("lab", prefix=f"one/datasets/{dataset}/v1")
-    kept, local = read_arrays(ObjectStore(version, read_only=True)), read_arrays(pulled)
-    assert kept.keys() == served.keys() == local.keys() >= {"views", "centerline", "sample_key"}
-    for name, values in kept.items():
+    stored, local = read_arrays(ObjectStore(version, read_only=True)), read_arrays(pulled)
+    assert stored.keys() == served.keys() == local.keys() >= {"views", "centerline", "sample_key"}
+    for name, values in stored.items():
         assert np.array_equal(values, served[name], equal_nan=values.dtype.kind == "f")
         assert np.array_equal(values, local[name], equal_nan=values.dtype.kind == "f")
-    solution = solve_rods(kept["gamma"], kept["phi0"], kept["phi1"])
-    assert np.array_equal(kept["centerline"], solution.centerline.astype(np.float32))
-    assert kept["views"].reshape(6, -1).max(axis=1).all()
+    solution = solve_rods(stored["gamma"], stored["phi0"], stored["phi1"])
+    assert np.array_equal(stored["centerline"], solution.centerline.astype(np.float32))
+    assert stored["views"].reshape(6, -1).max(axis=1).all()
 
     place = ["--data", str(service.data), "--store", "s3://lab/one"]
     collected = subprocess.run(

@@ -98,14 +98,14 @@ def test_a_cloth_job_from_refusal_to_dataset(
     ):
         assert words in refused.stderr
 
-    made: dict[str, Any] = {"preset": "certified", "extent": "full"}
-    alone = certificate.model_copy(update=made)
+    expected: dict[str, Any] = {"preset": "certified", "extent": "full"}
+    alone = certificate.model_copy(update=expected)
     of_rods = certificate.protocols
-    made["protocols"] = (
+    expected["protocols"] = (
         *of_rods,
         *(of_rods[0].model_copy(update={"protocol": name}) for name in CONTACT_PROTOCOLS),
     )
-    full = certificate.model_copy(update=made)
+    full = certificate.model_copy(update=expected)
     with Client(server.url) as client:
         client.register(alone)
         refused = cli("submit", spec)

@@ -181,7 +181,9 @@ def test_ray_is_replaced_at_once_when_it_dies(service: Service) -> None:
         """Return the session of a dispatcher to which Ray answers: it registers before."""
         workers = service.get("/v1/workers")
         ready = [
-            one["id"] for one in workers if one["alive"] and one["condition"]["state"] == "ready"
+            worker["id"]
+            for worker in workers
+            if worker["alive"] and worker["condition"]["state"] == "ready"
         ]
         return ready[0] if ready else None
 
@@ -283,9 +285,9 @@ def kill_some(service: Service, victim: str) -> None:
     """Kill what a victim names; what nobody starts again by itself is started again."""
     assert service.process is not None
     if victim in ("supervisor", "all"):
-        others = descendants(service.process.pid) if victim == "all" else []
+        children = descendants(service.process.pid) if victim == "all" else []
         service.kill()
-        for pid in others:
+        for pid in children:
             try:
                 kill(pid)
             except ProcessLookupError:
@@ -419,7 +421,7 @@ def test_two_nodes_on_one_database_and_one_bucket_survive_random_kills(
     settings = Settings.chosen(data=nodes[0].data, store=BUCKET)
     check_ledger(settings)
 
-    found = collected(
+    count = collected(
         settings, "--delete"
     )  # what calls that were killed had written: another batch, another name
     assert collected(settings) == 0
@@ -428,7 +430,7 @@ def test_two_nodes_on_one_database_and_one_bucket_survive_random_kills(
         check_dataset(store, job["dataset"], many_rods(number), builds)
     with capsys.disabled():
         print(
-            f"{KILLS} kills: each of {len(over) * RODS} samples once; {found} files of killed "
+            f"{KILLS} kills: each of {len(over) * RODS} samples once; {count} files of killed "
             "calls collected"
         )
         print(f"    longest gap without progress {watch.longest:.1f} s")
@@ -438,8 +440,8 @@ def collected(settings: Settings, *options: str) -> int:
     """Return how many files `stickslip gc` found."""
     place = ["--data", str(settings.data), "--store", settings.store_place]
     words = [str(STICKSLIP), "gc", "--older-than", "0", *place, *options]
-    said = subprocess.run(words, capture_output=True, text=True, check=False)
-    assert said.returncode == 0, said.stderr
-    count = re.match(r"(\d+) files", said.stdout)
+    result = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    count = re.match(r"(\d+) files", result.stdout)
     assert count is not None
     return int(count[1])

@@ -97,8 +97,8 @@ def test_friction_has_one_range() -> None:
     ],
 )
 def test_the_core_takes_every_fabric_that_a_spec_may_have(numbers: dict[str, Any]) -> None:
-    made = FabricNumbers.model_validate(numbers)
-    stickslip_sim_core.custom_fabric("own", **made.numbers())
+    fabric_numbers = FabricNumbers.model_validate(numbers)
+    stickslip_sim_core.custom_fabric("own", **fabric_numbers.numbers())
     stiffer = {"young": 1e9, "thickness": 0.01, "poisson": 0.3, "density": 0.2}
     with pytest.raises(ValidationError, match="young times thickness must be at most 1e"):
         FabricNumbers.model_validate(stiffer)

@@ -51,22 +51,22 @@ def help_of(program: str, *verbs: str) -> str:
 
 def python_commands() -> list[tuple[str, str]]:
     """Return the commands of our programs in all files, with their arguments, on one line each."""
-    found = []
+    commands = []
     for path in [*DOCKERFILES, *UNITS, SBATCH, CLUSTER, *GUIDES]:
         text = path.read_text().replace("\\\n", " ").replace('", "', " ").replace('"', " ")
-        found += [
+        commands += [
             (path.name, line)
             for line in text.splitlines()
             if any(f"-m {name}" in line for name in PROGRAMS)
         ]
     services = COMPOSE["services"]
-    found.append(
+    commands.append(
         (
             "compose.yaml",
             f"-m stickslip_services.app {' '.join(services['coordinator']['command'])}",
         )
     )
-    return [*found, ("compose.yaml", services["worker"]["command"][0])]
+    return [*commands, ("compose.yaml", services["worker"]["command"][0])]
 
 
 @pytest.mark.parametrize(("place", "line"), python_commands())
@@ -75,12 +75,12 @@ def test_programs_have_the_options_that_they_are_given(place: str, line: str) ->
     rest = re.split(r" (?:&&|>|&)(?: |$)", line.split(f"-m {program}", 1)[1])[0]
     verb = re.match(r"\s*(dispatch|certify|describe|replay)\b", rest)
     known = set(_OPTION.findall(help_of(program, *([verb[1]] if verb else []))))
-    given = set(_OPTION.findall(rest))
-    assert given <= known, (place, given - known)
+    options = set(_OPTION.findall(rest))
+    assert options <= known, (place, options - known)
 
 
 def stickslip_commands() -> list[tuple[str, list[str]]]:
-    found = []
+    commands = []
     for guide in GUIDES:
         for block in re.findall(r"```sh\n(.*?)```", guide.read_text(), re.S):
             for line in block.replace("\\\n", " ").splitlines():
@@ -90,19 +90,19 @@ def stickslip_commands() -> list[tuple[str, list[str]]]:
                         place == 0 or words[place - 1] in ("coordinator", "--")
                     )
                     if is_first or word.endswith("/bin/stickslip"):
-                        found.append((guide.name, words[place + 1 :]))
-    return found
+                        commands.append((guide.name, words[place + 1 :]))
+    return commands
 
 
 @pytest.mark.parametrize(("place", "words"), stickslip_commands())
 def test_commands_of_the_guides_exist(place: str, words: list[str]) -> None:
     verbs = words[:2] if words[0] in ("keys", "datasets") else words[:1]
     verbs = [verb for verb in verbs if not verb.startswith("-")]
-    shown = CliRunner().invoke(app, [*verbs, "--help"], env={"COLUMNS": "200"})
-    assert shown.exit_code == 0, shown.output
-    known = set(_OPTION.findall(shown.output))
-    given = {word.split("=")[0] for word in words if word.startswith("--")}
-    assert given <= known, (place, given - known)
+    result = CliRunner().invoke(app, [*verbs, "--help"], env={"COLUMNS": "200"})
+    assert result.exit_code == 0, result.output
+    known = set(_OPTION.findall(result.output))
+    options = {word.split("=")[0] for word in words if word.startswith("--")}
+    assert options <= known, (place, options - known)
 
 
 def test_the_guides_name_files_that_exist() -> None:
@@ -124,9 +124,10 @@ def test_images(path: Path) -> None:
         for line in re.findall(r"^COPY (?!--from)(.+)$", text, re.M)
         for source in line.split()[:-1]
     }
-    kept = [line[1:] for line in ignored if line.startswith("!")]
+    exceptions = [line[1:] for line in ignored if line.startswith("!")]
     assert all(
-        any(source == name or source.startswith(f"{name}/") for name in kept) for source in copied
+        any(source == name or source.startswith(f"{name}/") for name in exceptions)
+        for source in copied
     ), copied
     for extra in ("ray", "torch", "bpy"):
         assert path.name.startswith("worker") or f"[{extra}]" not in text
@@ -137,10 +138,10 @@ def linter(name: str, package: str) -> str:
 
     Skip the test if there is none.
     """
-    found = shutil.which(name, path=str(Path(sys.executable).parent)) or shutil.which(name)
-    if found is None:
+    program = shutil.which(name, path=str(Path(sys.executable).parent)) or shutil.which(name)
+    if program is None:
         pytest.skip(f"{name} is not installed: pip install {package}")
-    return found
+    return program
 
 
 def complaints(*command: str | Path) -> str:
@@ -168,9 +169,9 @@ def test_yamllint() -> None:
           document-start: disable
           comments: {min-spaces-from-content: 1}
     """
-    found = [*DEPLOY.rglob("*.yaml"), *(ROOT / "examples").glob("*.yaml")]
+    documents = [*DEPLOY.rglob("*.yaml"), *(ROOT / "examples").glob("*.yaml")]
     files = [
-        path for path in found if path.parent.name != "templates"
+        path for path in documents if path.parent.name != "templates"
     ]  # those are YAML once they are rendered
     assert len(files) > 8
     assert (
@@ -341,20 +342,20 @@ def test_slurm_runs_one_ray_on_all_nodes(tmp_path: Path) -> None:
         "SLURM_JOB_NUM_NODES": "2",
         "SLURM_JOB_NODELIST": "n[1-2]",
     }
-    said = [
+    lines = [
         subprocess.check_output(["bash", CLUSTER], env=environment, text=True).split()
         for _ in range(2)
     ]
-    (token, ray, verb, *words), (other, *_) = said
+    (token, ray, verb, *words), (other, *_) = lines
     assert token != other
     assert len(token) == 64
     assert (ray, verb) == ("ray", "symmetric-run")
     split = words.index("--")
     assert "--address n1:6379 --min-nodes 2" in " ".join(words[:split])
     assert "--ray-address n1:6379" in " ".join(words[split:])
-    shown = subprocess.check_output([linter("ray", "ray"), "start", "--help"], text=True)
+    help_text = subprocess.check_output([linter("ray", "ray"), "start", "--help"], text=True)
     assert {word for word in words[:split] if word.startswith("--")} - {"--min-nodes"} <= set(
-        _OPTION.findall(shown)
+        _OPTION.findall(help_text)
     )
 
 

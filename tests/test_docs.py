@@ -39,13 +39,13 @@ def example(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 def test_the_pictures_give_the_centreline(example: dict[str, Any]) -> None:
     from stickslip_sim_core import solve_general_rods
 
-    found = example["found"]
-    assert found.verdict == "good"
+    fit = example["found"]
+    assert fit.verdict == "good"
     s = np.linspace(0.0, 1.0, 150)
     truth = solve_general_rods(
         np.stack([3 + 0 * s, 0 * s, 6 + 10 * s], axis=1)[None], [300.0]
     ).centerline[0]
-    assert np.linalg.norm(found.centerline - truth, axis=1).mean() < 1e-3
+    assert np.linalg.norm(fit.centerline - truth, axis=1).mean() < 1e-3
 
 
 def test_the_fit_gives_the_natural_shape(example: dict[str, Any]) -> None:
@@ -60,7 +60,7 @@ def test_the_page_shows_what_the_code_draws(example: dict[str, Any]) -> None:
 
     for name in ("centerline.png", "natural.png"):
         with (
-            Image.open(example["out"] / name) as made,
-            Image.open(ROOT / "docs/figures/from-four-pngs" / name) as shown,
+            Image.open(example["out"] / name) as drawn,
+            Image.open(ROOT / "docs/figures/from-four-pngs" / name) as published,
         ):
-            assert made.size == shown.size
+            assert drawn.size == published.size

@@ -185,13 +185,13 @@ def test_the_code_of_a_dataset_card_runs(rods: Path, monkeypatch: pytest.MonkeyP
 
 
 def test_the_reference_of_specs_is_up_to_date() -> None:
-    made = subprocess.run(
+    result = subprocess.run(
         [sys.executable, ROOT / "tools/spec_reference.py"],
         capture_output=True,
         text=True,
         check=True,
     )
-    assert made.stdout == (ROOT / "docs/spec.md").read_text(), (
+    assert result.stdout == (ROOT / "docs/spec.md").read_text(), (
         "run: python tools/spec_reference.py > docs/spec.md"
     )
 

@@ -80,11 +80,11 @@ def test_the_job_ends_and_says_what_was_rejected(
 def test_all_that_listens_is_on_loopback(service: Service, job: dict[str, Any]) -> None:
     """The coordinator, and Ray, which has run the job."""
     assert service.process is not None
-    ours = {service.process.pid, *descendants(service.process.pid)}
+    pids = {service.process.pid, *descendants(service.process.pid)}
     listeners = subprocess.run(
         ["ss", "-ltnpH"], capture_output=True, text=True, check=True
     ).stdout.splitlines()
-    places = [line.split()[3] for line in listeners if any(f"pid={pid}," in line for pid in ours)]
+    places = [line.split()[3] for line in listeners if any(f"pid={pid}," in line for pid in pids)]
     assert len(places) >= 3
     assert all("127.0.0.1]:" in place or place.startswith("127.0.0.1:") for place in places), places
 
@@ -143,7 +143,7 @@ def test_every_reader_sees_the_same_bits(
         if where == "disk"
         else {"driver": "http", "base_url": place}
     )
-    ours = DatasetReader(directory if where == "disk" else place)
+    reader = DatasetReader(directory if where == "disk" else place)
     assert set(data.variables) == set(group)
     valid = np.flatnonzero(group["valid"])
     for name, expected in group.items():
@@ -156,9 +156,9 @@ def test_every_reader_sees_the_same_bits(
         other = tensorstore.open({"driver": "zarr3", "kvstore": store}).result().read().result()
         assert np.asarray(other).tobytes() == expected.tobytes(), name
         assert np.array_equal(
-            ours.read(name, valid), expected[valid], equal_nan=expected.dtype.kind == "f"
+            reader.read(name, valid), expected[valid], equal_nan=expected.dtype.kind == "f"
         ), name
-    ours.close()
+    reader.close()
     del data
     gc.collect()  # here, where the warning about those connections is expected
 

@@ -62,14 +62,14 @@ def of_kind(objects: list[dict[str, Any]], kind: str) -> dict[str, dict[str, Any
 
 def pods(objects: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
     """Return the specs of all Pods, by what they are."""
-    found = {}
+    templates = {}
     for item in objects:
         if item["kind"] in ("Deployment", "Job"):
-            found[item["metadata"]["name"]] = item["spec"]["template"]["spec"]
+            templates[item["metadata"]["name"]] = item["spec"]["template"]["spec"]
         if item["kind"] == "RayCluster":
             for group in (item["spec"]["headGroupSpec"], *item["spec"]["workerGroupSpecs"]):
-                found[group.get("groupName", "head")] = group["template"]["spec"]
-    return found
+                templates[group.get("groupName", "head")] = group["template"]["spec"]
+    return templates
 
 
 @pytest.mark.parametrize("name", CI)
@@ -191,13 +191,13 @@ def test_strict_means_strict() -> None:
 
 
 def changed(values: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
-    made: dict[str, Any] = json.loads(json.dumps(values))
+    document: dict[str, Any] = json.loads(json.dumps(values))
     *parents, last = path.split(".")
-    place = made
+    place = document
     for parent in parents:
         place = place.setdefault(parent, {})
     place[last] = value
-    return made
+    return document
 
 
 @pytest.mark.parametrize(
@@ -252,9 +252,9 @@ def test_every_value_is_in_the_schema_and_is_used() -> None:
 
 @pytest.mark.parametrize("name", CI)
 def test_pods_may_do_little(name: str) -> None:
-    found = pods(rendered(CI[name]))
-    assert len(found) >= 3
-    for pod in found.values():
+    templates = pods(rendered(CI[name]))
+    assert len(templates) >= 3
+    for pod in templates.values():
         assert pod["securityContext"]["runAsNonRoot"] is True
         assert pod["securityContext"]["runAsUser"] == 10001
         assert pod["automountServiceAccountToken"] is False
@@ -273,11 +273,11 @@ def test_pods_may_do_little(name: str) -> None:
 
 
 def test_pods_have_the_time_that_a_drain_takes() -> None:
-    found = pods(rendered(CI["minimal"])) | pods(rendered(CI["ray"]))
+    templates = pods(rendered(CI["minimal"])) | pods(rendered(CI["ray"]))
     drain = WorkerSettings(urls=(), store="", name="").stop_seconds
     for name in ("demo-worker", "demo-ray-dispatcher"):
-        assert found[name]["terminationGracePeriodSeconds"] >= 2 * drain
-    assert found["demo-coordinator"]["terminationGracePeriodSeconds"] >= 2 * GRACE_SECONDS
+        assert templates[name]["terminationGracePeriodSeconds"] >= 2 * drain
+    assert templates["demo-coordinator"]["terminationGracePeriodSeconds"] >= 2 * GRACE_SECONDS
 
 
 def commands(name: str) -> Iterator[tuple[str, list[str]]]:
@@ -309,12 +309,15 @@ def options(program: str, *verb: str) -> set[str]:
 
 @pytest.mark.parametrize("name", CI)
 def test_programs_have_the_options_that_they_are_given(name: str) -> None:
-    found = list(commands(name))
-    assert {program for program, _ in found} == {"stickslip_services.app", "stickslip_workers"}
-    for program, arguments in found:
+    commands_of_chart = list(commands(name))
+    assert {program for program, _ in commands_of_chart} == {
+        "stickslip_services.app",
+        "stickslip_workers",
+    }
+    for program, arguments in commands_of_chart:
         verb = [word for word in arguments[:1] if not word.startswith("-")]
-        given = {word.split("=")[0] for word in arguments if word.startswith("--")}
-        assert given <= options(program, *verb), program
+        option_names = {word.split("=")[0] for word in arguments if word.startswith("--")}
+        assert option_names <= options(program, *verb), program
 
 
 def test_ray_is_of_the_version_of_the_image() -> None:
@@ -328,9 +331,9 @@ def test_ray_is_of_the_version_of_the_image() -> None:
 def test_only_who_must_reaches_the_coordinator() -> None:
     policies = of_kind(rendered(CI["full"]), "NetworkPolicy")
     (rule,) = policies["coordinator"]["spec"]["ingress"]
-    own, *others = rule["from"]
-    assert own["podSelector"]["matchExpressions"][0]["values"] == ["worker", "dispatcher"]
-    assert others == CI["full"]["networkPolicy"]["from"]
+    release, *further = rule["from"]
+    assert release["podSelector"]["matchExpressions"][0]["values"] == ["worker", "dispatcher"]
+    assert further == CI["full"]["networkPolicy"]["from"]
     assert policies["worker"]["spec"]["policyTypes"] == ["Ingress"]
     assert "ingress" not in policies["worker"]["spec"]  # nobody
     ray = of_kind(rendered(CI["ray"]), "NetworkPolicy")["ray"]["spec"]
@@ -361,17 +364,17 @@ def metrics(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
         worker.finish(*worker.lease())
         worker.finish(*worker.lease())
         text = httpx.get(f"{url}/metrics", trust_env=False).text
-    found: dict[str, set[str]] = {}
+    labels_of_metric: dict[str, set[str]] = {}
     for name, labels in re.findall(r"^(stickslip_\w+)(?:\{(.*)\})? ", text, re.M):
-        found.setdefault(name, set()).update(re.findall(r'(\w+)="', labels))
-    return found
+        labels_of_metric.setdefault(name, set()).update(re.findall(r'(\w+)="', labels))
+    return labels_of_metric
 
 
 def expressions() -> list[str]:
     dashboard = json.loads((CHART / "files" / "dashboard.json").read_text())
-    found = [target["expr"] for panel in dashboard["panels"] for target in panel["targets"]]
+    texts = [target["expr"] for panel in dashboard["panels"] for target in panel["targets"]]
     (scaled,) = of_kind(rendered(CI["full"]), "ScaledObject").values()
-    return [*found, scaled["spec"]["triggers"][0]["metadata"]["query"]]
+    return [*texts, scaled["spec"]["triggers"][0]["metadata"]["query"]]
 
 
 STATES: dict[str, set[str]] = {

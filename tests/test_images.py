@@ -120,14 +120,14 @@ class Images:
         self._build(ROOT / "deploy" / "images" / f"{name}.Dockerfile", ROOT, name)
 
     def _build(self, file: Path, context: Path, tag: str, *options: str) -> None:
-        own = ("/etc/apt/sources.list.d", "/etc/apt/apt.conf.d", "/etc/ssl/certs")
-        volumes = [f"--volume={path}:{path}:ro" for path in own if Path(path).exists()]
+        mounted = ("/etc/apt/sources.list.d", "/etc/apt/apt.conf.d", "/etc/ssl/certs")
+        volumes = [f"--volume={path}:{path}:ro" for path in mounted if Path(path).exists()]
         options = ("--isolation=chroot", "--pull-never", *options, *volumes, *OPTIONS)
         self.buildah("build", *options, "--file", file, "--tag", tag, context)
 
     def size(self, name: str) -> int:
         """Return how large the files of an image are, as `docker images` counts [bytes]."""
-        said = run(
+        result = run(
             "du",
             "--summarize",
             "--apparent-size",
@@ -135,15 +135,15 @@ class Images:
             "--one-file-system",
             self.tree(name),
         )
-        return int(said.split()[0])
+        return int(result.split()[0])
 
     def config(self, name: str) -> dict[str, Any]:
         """Return what is set for containers of an image."""
         self.tree(name)
-        found: dict[str, Any] = json.loads(self.buildah("inspect", "--type=image", name))["OCIv1"][
-            "config"
-        ]
-        return found
+        document: dict[str, Any] = json.loads(self.buildah("inspect", "--type=image", name))[
+            "OCIv1"
+        ]["config"]
+        return document
 
     def command(self, name: str, data: Path, words: list[str]) -> list[str]:
         """Return the command that runs `words` in an image; without any, its entry point."""
@@ -199,11 +199,11 @@ def images() -> Iterator[Images]:
             pytest.skip(f"{program} is not installed: apt-get install buildah debootstrap")
     place = PLACE / f"stickslip-images-{os.getpid()}"
     place.mkdir()
-    made = Images(place)
+    built = Images(place)
     try:
-        yield made
+        yield built
     finally:
-        made.tidy()
+        built.tidy()
 
 
 @pytest.fixture
@@ -232,17 +232,17 @@ def test_nobody_is_root_and_nothing_can_be_changed(images: Images, name: str, da
         "id -u; for place in / /opt/stickslip /etc; do touch $place/x 2>&1 || true; done; "
         "touch /tmp/x /data/x"
     )
-    said = run(*images.command(name, data, ["sh", "-c", script])).splitlines()
-    assert said[0] == str(USER)
-    assert [line.rpartition(": ")[2] for line in said[1:]] == ["Read-only file system"] * 3
+    result = run(*images.command(name, data, ["sh", "-c", script])).splitlines()
+    assert result[0] == str(USER)
+    assert [line.rpartition(": ")[2] for line in result[1:]] == ["Read-only file system"] * 3
     assert (data / "x").stat().st_uid == USER
 
 
 def test_the_worker_says_what_it_is(images: Images, data: Path) -> None:
-    said = json.loads(run(*images.command("worker", data, images.entry("worker", "describe"))))
-    assert set(said["builds"]) == set(KINDS)
+    document = json.loads(run(*images.command("worker", data, images.entry("worker", "describe"))))
+    assert set(document["builds"]) == set(KINDS)
     written = run(*images.command("worker", data, ["cat", "/usr/share/doc/stickslip/builds.json"]))
-    assert json.loads(written) == said
+    assert json.loads(written) == document
     blender = [
         "/opt/stickslip/.venv-blender/bin/python",
         "-c",
@@ -252,8 +252,8 @@ def test_the_worker_says_what_it_is(images: Images, data: Path) -> None:
 
 
 def test_the_coordinator_has_only_what_it_needs(images: Images, data: Path) -> None:
-    said = run(*images.command("coordinator", data, images.entry("coordinator", "--openapi")))
-    assert json.loads(said) == json.loads((ROOT / "docs" / "openapi.json").read_text())
+    result = run(*images.command("coordinator", data, images.entry("coordinator", "--openapi")))
+    assert json.loads(result) == json.loads((ROOT / "docs" / "openapi.json").read_text())
     names = "ray", "torch", "bpy", "pip", "stickslip_workers", "stickslip_sim_core"
     asked = (
         f"from importlib.util import find_spec; print([name for name in {names} if "
@@ -313,7 +313,11 @@ def test_both_make_a_dataset(images: Images, data: Path) -> None:
             job = httpx.post(f"{url}/v1/jobs", json=spec, trust_env=False).json()["id"]
 
             def over() -> Any:
-                found = job_when(f"/v1/jobs/{job}")
-                return found if found is not None and found["finished_at"] is not None else None
+                job_document = job_when(f"/v1/jobs/{job}")
+                return (
+                    job_document
+                    if job_document is not None and job_document["finished_at"] is not None
+                    else None
+                )
 
             assert wait_for("the job", over, 300)["state"] == "succeeded"

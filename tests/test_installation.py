@@ -79,16 +79,16 @@ def test_the_demo_installs_no_tool_of_tests_or_documentation() -> None:
 @pytest.mark.parametrize("path", [*TEXTS, *SOURCES], ids=lambda path: str(path.relative_to(ROOT)))
 def test_what_pip_is_told_to_install_can_be_installed(path: Path) -> None:
     """Our distributions are on no index: they are installed from folders, with what they need."""
-    ours = {*FOLDERS, "stickslip-sim-core", "stickslip-workers"}
+    packages = {*FOLDERS, "stickslip-sim-core", "stickslip-workers"}
     for targets in commands(path.read_text()):
         folders = [target.partition("[")[0] for target in targets if target.startswith("./")]
         names = [target for target in targets if not target.startswith(("./", "-"))]
-        assert not {name.partition("[")[0] for name in names} & ours, targets
+        assert not {name.partition("[")[0] for name in names} & packages, targets
         for folder in folders:
             project = tomllib.loads((ROOT / folder / "pyproject.toml").read_text())["project"]
             for text in project["dependencies"]:
                 dependency = Requirement(text).name
-                if dependency in ours:
+                if dependency in packages:
                     assert folder_of(dependency) in folders, (targets, dependency)
         for target in targets:
             if target.startswith("./") and "[" in target:

@@ -125,11 +125,11 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
 
 def names_and_labels(series: dict[str, list[str]]) -> dict[str, set[str]]:
     """Return the labels of each metric."""
-    found: dict[str, set[str]] = {}
+    labels_of_metric: dict[str, set[str]] = {}
     for name in series:
         metric, _, labels = name.partition("{")
-        found.setdefault(metric, set()).update(re.findall(r'(\w+)="', labels))
-    return found
+        labels_of_metric.setdefault(metric, set()).update(re.findall(r'(\w+)="', labels))
+    return labels_of_metric
 
 
 def test_every_rule_asks_for_metrics_and_labels_that_exist(

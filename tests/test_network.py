@@ -32,30 +32,30 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(2400), pytest.mark.xdist_gro
 def test_work_goes_on_whatever_happens_to_machines(
     hub: int, lab: Lab, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def say(what: str, seconds: float) -> None:
+    def say(message: str, seconds: float) -> None:
         with capsys.disabled():
-            print(f"    {what:55} {seconds:5.1f} s, load {os.getloadavg()[0]:.1f}", flush=True)
+            print(f"    {message:55} {seconds:5.1f} s, load {os.getloadavg()[0]:.1f}", flush=True)
 
     def lost(name: str, how: str) -> None:
         """Expect that the loss of a machine is noticed, and that others do its work."""
         held = lab.held(name)
-        ran = [seq for seq, state in held.items() if state == "running"]
+        running = [seq for seq, state in held.items() if state == "running"]
         say(
             f"{how}: its {len(held)} tasks are free",
             lab.wait(f"the loss of {name}", lambda: not lab.held(name)),
         )
-        say(f"{how}: what ran on it is done", lab.wait("its tasks", lambda: lab.left(ran) == 0))
+        say(f"{how}: what ran on it is done", lab.wait("its tasks", lambda: lab.left(running) == 0))
 
     with ExitStack() as stack:
-        one, other, late = (
+        first, other, late = (
             Machine(name, number, hub, stack) for number, name in enumerate("abc", 11)
         )
-        for machine in (one, other):
+        for machine in (first, other):
             machine.start(dispatch(machine.name, tmp_path), tmp_path / f"{machine.name}.log")
         lab.wait("work of both", lambda: all(lab.done(name) > 3 for name in "ab"))
 
         lab.wait("a task that runs", lambda: "running" in lab.held("a").values())
-        one.kill()
+        first.kill()
         lost("a", "killed")
 
         late.start(dispatch("c", tmp_path), tmp_path / "c.log")
@@ -158,13 +158,16 @@ def test_nodes_of_the_charts_ray_cluster_come_and_go(
                 command = ["env", f"PYTHONPATH={tmp_path / 'other'}", *command]
             machines[name].start(command, tmp_path / f"{name}.log", is_pod=True)
 
-        def expect(what: str, is_so: Callable[[], bool], limit: float) -> None:
+        def expect(condition: str, is_so: Callable[[], bool], limit: float) -> None:
             """Wait; the limit [s] is that of a quiet machine."""
-            seconds = lab.wait(what, is_so, limit)
+            seconds = lab.wait(condition, is_so, limit)
             with capsys.disabled():
-                print(f"    {what:65} {seconds:5.1f} s, load {os.getloadavg()[0]:.1f}", flush=True)
+                print(
+                    f"    {condition:65} {seconds:5.1f} s, load {os.getloadavg()[0]:.1f}",
+                    flush=True,
+                )
 
-        def lose(name: str, how: Callable[[], None], what: str, limit: float) -> None:
+        def remove_node(name: str, how: Callable[[], None], condition: str, limit: float) -> None:
             """Lose a node that is at work, and expect that all that the dispatcher had then is
             done.
             """
@@ -172,7 +175,7 @@ def test_nodes_of_the_charts_ray_cluster_come_and_go(
             held = lab.held("demo-ray")
             assert held
             how()
-            expect(f"{what}: all tasks are done elsewhere", lambda: lab.left(held) == 0, limit)
+            expect(f"{condition}: all tasks are done elsewhere", lambda: lab.left(held) == 0, limit)
 
         for name in ("head", "w1", "w2", "driver"):
             start(name)
@@ -180,18 +183,20 @@ def test_nodes_of_the_charts_ray_cluster_come_and_go(
         start("late")
         expect("a node comes late: its first task runs", machines["late"].is_at_work, 15)
         start("foreign")
-        said = "node foreign (10.213.0.36) has other builds"
+        refusal = "node foreign (10.213.0.36) has other builds"
         expect(
             "a node has other builds: it is named",
-            lambda: said in lab.worker("demo-ray")["condition"]["reason"],
+            lambda: refusal in lab.worker("demo-ray")["condition"]["reason"],
             40,
         )
-        lose("w1", machines["w1"].kill, "a node is killed", 15)
-        lose("w2", machines["w2"].freeze, "a node freezes", 40)
+        remove_node("w1", machines["w1"].kill, "a node is killed", 15)
+        remove_node("w2", machines["w2"].freeze, "a node freezes", 40)
         machines["w2"].kill()
         start("w1")
         lab.wait("work of a node that is back", machines["w1"].is_at_work)
-        lose("late", lambda: machines["late"].plug("down"), "the network of a node is cut", 40)
+        remove_node(
+            "late", lambda: machines["late"].plug("down"), "the network of a node is cut", 40
+        )
         machines["late"].plug("up")
         assert not machines["foreign"].is_at_work()
 

@@ -75,14 +75,14 @@ def certificate(**change: Any) -> Certificate:
         )
         for name in change.pop("names", SCENE_PROTOCOLS)
     )
-    given = {"preset": "fast", "sim_core": solver_build(SOLVER), "extent": "full"} | change
+    fields = {"preset": "fast", "sim_core": solver_build(SOLVER), "extent": "full"} | change
     return Certificate(
         numbers={},
         protocol_sources="b" * 64,
         protocols=protocols,
         passed=True,
         environment={},
-        **given,
+        **fields,
     )
 
 
@@ -105,12 +105,12 @@ def test_from_the_file_to_trajectories(folder: Path) -> None:
     )
     assert ended.returncode == 0, ended.stderr
     assert "NOT certified: there is no certificate" in ended.stdout + ended.stderr
-    said = json.loads((folder / "out" / "scene.json").read_text())
-    assert said["valid"]
-    assert not said["certified"]
-    with np.load(folder / "out" / "trajectory.npz") as found:
-        path, forces = found["cloth.positions"], found["contact_force"]
-        assert found["cloth.rest"].shape == (20, 2)
+    document = json.loads((folder / "out" / "scene.json").read_text())
+    assert document["valid"]
+    assert not document["certified"]
+    with np.load(folder / "out" / "trajectory.npz") as trajectory:
+        path, forces = trajectory["cloth.positions"], trajectory["contact_force"]
+        assert trajectory["cloth.rest"].shape == (20, 2)
     assert path.shape == (4, 20, 3)
     # The table has lifted it by 2 cm, and carries its weight.
     assert path[-1, :, 2] == pytest.approx(np.full(20, 0.07), abs=1e-3)
@@ -133,25 +133,25 @@ def test_a_file_that_is_wrong_is_refused_with_field_rule_and_value(folder: Path)
     program = [sys.executable, "-m", "stickslip_services.cli", "simulate", "scene.yaml", "out"]
     ended = subprocess.run(program, cwd=folder, capture_output=True, text=True, check=False)
     assert ended.returncode == 1
-    said = " ".join(ended.stderr.split())
-    assert "sheets.cloth.mesh.cells.0: must be greater than or equal to 1, and it is 0" in said
+    message = " ".join(ended.stderr.split())
+    assert "sheets.cloth.mesh.cells.0: must be greater than or equal to 1, and it is 0" in message
 
 
 def test_a_scene_is_checked_and_its_cost_named() -> None:
     """The cost is an interval that has the median of the samples that were measured."""
-    said = json.loads(CliRunner().invoke(app, ["scene", "check", "peg", "--json"]).stdout)
-    assert said["axes"]["speed"]["values"] == "-6 to 6 [rad/s]"
+    document = json.loads(CliRunner().invoke(app, ["scene", "check", "peg", "--json"]).stdout)
+    assert document["axes"]["speed"]["values"] == "-6 to 6 [rad/s]"
     assert {"cloth.positions", "cloth.contact", "mu", "fabric"} <= {
-        array["name"] for array in said["arrays"]
+        array["name"] for array in document["arrays"]
     }
-    cost = said["cost"]
+    cost = document["cost"]
     assert (cost["vertices"], cost["frames"]) == (441, 121)
     least, most = cost["cpu_seconds_a_sample"]
     results = Path(__file__).parents[1] / "benchmarks/results/scenes.json"
     (row,) = (row for row in json.loads(results.read_text())["rows"] if row["scene"] == "peg")
     assert least < row["CPU s a sample, least, median, most"][1] < most
-    shown = CliRunner().invoke(app, ["scene", "check", "peg"], env={"COLUMNS": "200"}).output
-    assert f"takes {least:.2g} to {most:.2g} CPU s" in " ".join(shown.split())
+    output = CliRunner().invoke(app, ["scene", "check", "peg"], env={"COLUMNS": "200"}).output
+    assert f"takes {least:.2g} to {most:.2g} CPU s" in " ".join(output.split())
 
 
 @pytest.mark.parametrize(
@@ -165,11 +165,11 @@ def test_a_scene_is_checked_and_its_cost_named() -> None:
     ],
 )
 def test_a_scene_is_certified_by_what_it_touches(change: dict[str, Any], why: str) -> None:
-    found = why_uncertified(
+    reason = why_uncertified(
         spec_of(Scene.model_validate(SCENE)), certificate(**change), solver_build(SOLVER)
     )
-    assert found.startswith(why)
-    assert bool(found) == bool(why)
+    assert reason.startswith(why)
+    assert bool(reason) == bool(why)
 
 
 @pytest.mark.parametrize(
@@ -189,9 +189,9 @@ def test_a_scene_is_certified_by_what_it_touches(change: dict[str, Any], why: st
     ],
 )
 def test_a_scene_that_cannot_be_is_not_valid(place: str, value: Any, message: str) -> None:
-    made = deepcopy(SCENE)
-    made["sheets"]["cloth"][place] = value
-    physics = with_arrays(Scene.model_validate(made), lambda _name: TABLE.encode())
+    scene_document = deepcopy(SCENE)
+    scene_document["sheets"]["cloth"][place] = value
+    physics = with_arrays(Scene.model_validate(scene_document), lambda _name: TABLE.encode())
     (outcome,) = KIND.simulate([{"scene": physics, "seed": 0}], None)
     assert message in outcome.reason
 
@@ -214,7 +214,7 @@ def test_a_vertex_beyond_the_nearest_to_a_ridge_is_not_in_contact() -> None:
     """A sheet with cells of 1 cm falls on a ridge that is 2 mm beside a row of vertices: edges
     bear, and the next row, 8 mm away, touches nothing.
     """
-    made = {
+    ridge_scene = {
         "format": "stickslip-scene/1",
         "duration": 0.1,
         "frame_rate": 20,
@@ -228,7 +228,7 @@ def test_a_vertex_beyond_the_nearest_to_a_ridge_is_not_in_contact() -> None:
         },
         "bodies": {"ridge": {"type": "mesh", "file": "ridge.obj", "thickness": 0.0005}},
     }
-    physics = with_arrays(Scene.model_validate(made), lambda _name: RIDGE.encode())
+    physics = with_arrays(Scene.model_validate(ridge_scene), lambda _name: RIDGE.encode())
     run = scene(physics, seed=0).run()
     # The ridge is too sharp for these cells, and a run may be rejected for its friction.
     assert run.code in ("", "friction_error"), run.reason

@@ -40,20 +40,20 @@ looks:
 @pytest.mark.real
 @pytest.mark.slow
 @pytest.mark.skipif(not BLENDER_PYTHON.exists(), reason="no environment of Blender: make setup")
-@pytest.mark.parametrize("own", [False, True])
-def test_a_scene_is_drawn_before_it_is_simulated(tmp_path: Path, own: bool) -> None:
+@pytest.mark.parametrize("is_custom", [False, True])
+def test_a_scene_is_drawn_before_it_is_simulated(tmp_path: Path, is_custom: bool) -> None:
     scene = tmp_path / "fold.yaml"
     scene.write_text(FOLD)
     out = tmp_path / "pictures"
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    given = str(scene) if own else "turning-ball"
+    name = str(scene) if is_custom else "turning-ball"
     subprocess.run(
-        [sys.executable, "-m", "stickslip_services.cli", "scene", "preview", given, str(out)],
+        [sys.executable, "-m", "stickslip_services.cli", "scene", "preview", name, str(out)],
         check=True,
     )
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < CPU_SECONDS
-    views = ["above"] if own else ["front", "high", "side"]
+    views = ["above"] if is_custom else ["front", "high", "side"]
     assert sorted(path.name for path in out.iterdir()) == sorted(
         [*(f"{view}.png" for view in views), "motion.webp"]
     )
@@ -64,6 +64,6 @@ def test_a_scene_is_drawn_before_it_is_simulated(tmp_path: Path, own: bool) -> N
         moved = np.abs(np.asarray(clip.convert("RGB")) - first).max(axis=2) > 40
     assert 30 < moved.sum() < 0.2 * moved.size
     with Image.open(out / f"{views[0]}.png") as picture:
-        seen = np.asarray(picture.convert("RGB"), dtype=int)
-    if own:
-        assert ((seen[..., 0] > 150) & (seen[..., 1] < 100)).sum() > 200  # the block is red
+        pixels = np.asarray(picture.convert("RGB"), dtype=int)
+    if is_custom:
+        assert ((pixels[..., 0] > 150) & (pixels[..., 1] < 100)).sum() > 200  # the block is red

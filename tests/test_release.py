@@ -61,12 +61,12 @@ def test_every_distribution_carries_the_licence(name: str) -> None:
 def test_our_distributions_fit_together(name: str) -> None:
     project = PROJECTS[name]["project"]
     extras = [text for texts in project.get("optional-dependencies", {}).values() for text in texts]
-    ours = [
+    distributions = [
         Requirement(text)
         for text in (*project["dependencies"], *extras)
         if text.startswith("stickslip-")
     ]
-    for requirement in ours:
+    for requirement in distributions:
         assert requirement.specifier.contains(Version(VERSION)), (
             f"{requirement} does not admit {VERSION}"
         )
@@ -90,9 +90,9 @@ def test_the_version_is_written_once() -> None:
 def test_everything_that_is_installed_admits_the_python_of_debian_12(environment: str) -> None:
     packages = list(distributions(path=[str(ROOT / environment / "lib/python3.11/site-packages")]))
     needs = {
-        one.name: one.metadata["Requires-Python"]
-        for one in packages
-        if one.metadata["Requires-Python"]
+        package.name: package.metadata["Requires-Python"]
+        for package in packages
+        if package.metadata["Requires-Python"]
     }
     assert len(needs) > 20
     assert {name: need for name, need in needs.items() if "3.11.2" not in SpecifierSet(need)} == {}
@@ -103,12 +103,12 @@ PIP = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
 
 @pytest.fixture(scope="module")
 def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    found = tmp_path_factory.mktemp("wheels")
+    folder = tmp_path_factory.mktemp("wheels")
     for name in (*PURE, "sim_core"):
         subprocess.run(
-            [*PIP, "wheel", "--no-deps", "--wheel-dir", str(found), str(ROOT / name)], check=True
+            [*PIP, "wheel", "--no-deps", "--wheel-dir", str(folder), str(ROOT / name)], check=True
         )
-    return found
+    return folder
 
 
 def programs_of(wheels: Path, place: Path, *names: str) -> Path:

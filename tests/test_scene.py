@@ -118,12 +118,12 @@ def upload(service: Service, height: float) -> str:
     return str(answer.json()["file"])
 
 
-def run_job(service: Service, given: dict[str, Any], busy: set[str]) -> dict[str, Any]:
+def run_job(service: Service, spec: dict[str, Any], busy: set[str]) -> dict[str, Any]:
     """Run a job to its end and return it.
 
     Put the names of the dispatchers that are seen at work into `busy`.
     """
-    job = service.submit(given)
+    job = service.submit(spec)
 
     def probe() -> dict[str, Any] | None:
         busy.update(worker["name"] for worker in service.get("/v1/workers") if worker["running"])
@@ -140,7 +140,7 @@ def ready(service: Service) -> int:
     return sum(worker["condition"]["state"] == "ready" for worker in service.get("/v1/workers"))
 
 
-def ran(job: dict[str, Any]) -> dict[str, int]:
+def job_run(job: dict[str, Any]) -> dict[str, int]:
     """Return how many tasks of each stage a job has run itself."""
     stages = job["progress"]["stages"]
     return {name: sum(stage["counts"].values()) - stage["cached"] for name, stage in stages.items()}
@@ -151,7 +151,7 @@ def test_from_a_users_scene_to_a_training_batch(service: Service, tmp_path: Path
     busy: set[str] = set()
     block = upload(service, 0.02)
     job = run_job(service, spec(block), busy)
-    assert ran(job) == {"simulate": 8, "render": 8, "pack": 1, "publish": 1}
+    assert job_run(job) == {"simulate": 8, "render": 8, "pack": 1, "publish": 1}
     pulled = tmp_path / "pulled"
     version = job["dataset"]["dataset"]
     subprocess.run(
@@ -172,7 +172,7 @@ def test_from_a_users_scene_to_a_training_batch(service: Service, tmp_path: Path
     # The same file and the same spec again: nothing runs, and the same dataset answers.
     assert upload(service, 0.02) == block
     again = run_job(service, spec(block), busy)
-    assert set(ran(again).values()) == {0}
+    assert set(job_run(again).values()) == {0}
     assert again["dataset"] == job["dataset"]
     # One more friction: only its samples run.
     more = spec(block, mu=[0.2, 0.8, 1.0])
@@ -181,7 +181,7 @@ def test_from_a_users_scene_to_a_training_batch(service: Service, tmp_path: Path
     # One vertex of the block elsewhere: all runs, on both nodes together.
     wait_for("both nodes", lambda: ready(service) == 2 or None, 60)
     moved = run_job(service, spec(upload(service, 0.0199)), busy)
-    assert ran(moved) == ran(job)
+    assert job_run(moved) == job_run(job)
     assert moved["dataset"]["dataset"] != version
     assert len(busy) == 2
     assert "second" in busy

@@ -32,7 +32,7 @@ def physics(**scene: Any) -> dict[str, Any]:
     return Scene.model_validate(document).physics()
 
 
-def ran(**scene: Any) -> ClothRun:
+def outcome_of(**scene: Any) -> ClothRun:
     run = cloth_scene.scene(physics(**scene), seed=1).run()
     assert run.valid, run.reason
     return run
@@ -53,9 +53,9 @@ def test_a_built_in_scene_says_what_it_is_and_records_what_its_datasets_have(nam
     assert len(file.read_text().splitlines()) <= 80
     assert len(scene.description) > 80
     cells = {
-        f"sheets.{each}.mesh.cells": [max(4, count // 2) for count in given.mesh.cells]
-        for each, given in scene.sheets.items()
-        if given.mesh.type == "grid"
+        f"sheets.{each}.mesh.cells": [max(4, count // 2) for count in sheet.mesh.cells]
+        for each, sheet in scene.sheets.items()
+        if sheet.mesh.type == "grid"
     }
     length = {"end.at_most" if scene.end else "duration": 2.0 / scene.frame_rate}
     looks = {
@@ -77,11 +77,11 @@ def test_a_built_in_scene_says_what_it_is_and_records_what_its_datasets_have(nam
     assert isinstance(simulation, ClothSceneSimulation)
     (outcome,) = cloth_scene.KIND.simulate([simulation.inputs(built_in_files().__getitem__)], None)
     assert not outcome.reason
-    made = {**outcome.record, **outcome.labels}
+    values = {**outcome.record, **outcome.labels}
     for layout in spec.arrays():
-        if layout.name in made:
-            assert np.shape(made[layout.name]) == tuple(layout.shape), layout.name
-    missing = {layout.name for layout in spec.arrays()} - set(made)
+        if layout.name in values:
+            assert np.shape(values[layout.name]) == tuple(layout.shape), layout.name
+    missing = {layout.name for layout in spec.arrays()} - set(values)
     assert not {
         name for name in missing if "." in name or name.startswith(("holder", "body", "contact"))
     }, missing
@@ -124,7 +124,9 @@ def test_no_code_knows_the_name_of_a_scene() -> None:
 class TestLanguage:
     def test_sheets_on_a_floor_bear_each_other(self) -> None:
         sheets = {"a": SHEET, "b": SHEET | {"origin": [0, 0, 0.001]}}
-        run = ran(sheets=sheets, bodies={"floor": {"type": "plane"}}, duration=0.5, frame_rate=10)
+        run = outcome_of(
+            sheets=sheets, bodies={"floor": {"type": "plane"}}, duration=0.5, frame_rate=10
+        )
         assert run.record["contact_force"].shape == (6, 2, 3, 3)  # frame, sheet, (floor, a, b), xyz
         z = run.record["contact_force"][-1, :, :, 2]
         assert z == pytest.approx(
@@ -142,8 +144,8 @@ class TestLanguage:
         """
         document = load_scene("peg").model_dump(mode="json") | {"duration": 0.6, "frame_rate": 500}
         document["sheets"]["cloth"]["mesh"]["cells"] = [9, 9]
-        made = cloth_scene.scene(Scene.model_validate(document).physics(), seed=1)
-        run = made.run()
+        physics_scene = cloth_scene.scene(Scene.model_validate(document).physics(), seed=1)
+        run = physics_scene.run()
         # So few cells that are thrown may miss the error of steps that is allowed.
         assert run.code in ("", "step_error"), run.reason
         assert not run.self_intersections.any()
@@ -151,13 +153,13 @@ class TestLanguage:
         monkeypatch.setattr(
             Cloth, "positions_at", lambda cloth, time, straight=False: smooth(cloth, time)
         )
-        assert made.run().code == "crossings"
+        assert physics_scene.run().code == "crossings"
 
     def test_a_release_lets_go_without_a_kick(self) -> None:
         """A sheet thrown upward flies on as it was moved: the mean of z falls by g t^2/2."""
         keys = [{"time": 0}, {"time": 0.5, "move": [0, 0, 1]}]
         holder = {"vertices": list(range(24)), "grasp": [0, 0.25], "motion": {"keys": keys}}
-        run = ran(
+        run = outcome_of(
             sheets={"a": SHEET | {"holders": {"hand": holder}}},
             duration=0.5,
             frame_rate=20,
@@ -178,7 +180,9 @@ class TestLanguage:
             "grasp": [0.1, 100],
             "motion": {"keys": keys},
         }
-        run = ran(sheets={"a": SHEET | {"holders": {"hand": hand}}}, duration=2.0, frame_rate=20)
+        run = outcome_of(
+            sheets={"a": SHEET | {"holders": {"hand": hand}}}, duration=2.0, frame_rate=20
+        )
         caught = run.positions[2, -1]
         assert caught[2] == pytest.approx(-0.5 * GRAVITY * 0.1**2, abs=5e-3)
         assert run.positions[-1, -1] == pytest.approx(caught + np.array([0.0, 0.0, 0.05]), abs=1e-9)
@@ -193,14 +197,14 @@ class TestLanguage:
             "origin": [0, 0, -0.05],
             "motion": {"keys": keys},
         }
-        run = ran(sheets={"a": SHEET}, bodies={"slab": slab}, duration=2.5, frame_rate=4)
+        run = outcome_of(sheets={"a": SHEET}, bodies={"slab": slab}, duration=2.5, frame_rate=4)
         pose = run.record["body_pose"][-1, 0]
         along = (run.positions[-1] - pose[:, 3]) @ pose[:, 0]
         assert (along.mean() > 1e-3) == slips
 
     def test_a_scene_ends_at_rest_and_repeats_its_last_frame(self) -> None:
         end = {"when": "rest", "at_most": 3}
-        run = ran(
+        run = outcome_of(
             sheets={"a": SHEET | {"origin": [0, 0, 0.002]}},
             bodies={"floor": {"type": "plane"}},
             end=end,
@@ -220,7 +224,7 @@ class TestLanguage:
             "start": {"type": "stretched", "strain": [0.02, 0.01]},
         }
         sheets = {"hung": hung, "stretched": stretched | {"holders": {"frame": {"rim": True}}}}
-        run = ran(sheets=sheets, duration=0.3, frame_rate=10, gravity=[0, 0, -9.81])
+        run = outcome_of(sheets=sheets, duration=0.3, frame_rate=10, gravity=[0, 0, -9.81])
         moved = np.abs(run.positions[-1] - run.positions[0])
         assert moved[:25].max() < 2e-3  # its tilt ends
         assert np.ptp(run.positions[0, 25:, 0]) == pytest.approx(0.06 * 1.02)

@@ -28,22 +28,26 @@ pytestmark = [
 ]
 
 
-@pytest.mark.parametrize("what", ["agents", "all"])
+@pytest.mark.parametrize("module", ["agents", "all"])
 def test_a_machine_that_imports_slowly(
-    what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Every Python process takes 20 s to start, or every agent of Ray 25 s."""
     (tmp_path / "sitecustomize.py").write_text(SLOW)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setenv("SLOW", what)
+    monkeypatch.setenv("SLOW", module)
     service = Service(tmp_path / "data")
     service.start()
     try:
         job = service.submit(SPEC)
 
         def waits() -> bool | None:
-            said = [worker["condition"] for worker in service.get("/v1/workers")]
-            return True if any("waiting for Ray" in one["reason"] for one in said) else None
+            conditions = [worker["condition"] for worker in service.get("/v1/workers")]
+            return (
+                True
+                if any("waiting for Ray" in condition["reason"] for condition in conditions)
+                else None
+            )
 
         wait_for("the reason", waits, 120)
         assert service.finished(job, 300)["state"] == "succeeded"

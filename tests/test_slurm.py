@@ -70,11 +70,11 @@ class Slurm:
 
     def states(self) -> dict[str, tuple[str, int]]:
         """Return the state of each task of the array, and how often it was queued again."""
-        found = {}
+        states_of_jobs = {}
         for line in self("scontrol", "--oneliner", "show", "job", self.job).splitlines():
             words = dict(word.partition("=")[::2] for word in line.split() if "=" in word)
-            found[words["ArrayTaskId"]] = (words["JobState"], int(words["Restarts"]))
-        return found
+            states_of_jobs[words["ArrayTaskId"]] = (words["JobState"], int(words["Restarts"]))
+        return states_of_jobs
 
     def node_of(self, task: str) -> str:
         return self("squeue", "--noheader", "--jobs", f"{self.job}_{task}", "--format", "%N")
@@ -143,7 +143,7 @@ def slurm(hub: int, lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         for number, name in enumerate(NODES, 21):
             machine = Machine(name, number, hub, stack)
             machine.start(["slurmd", "-D"], tmp_path / f"{name}.log")
-        found = Slurm(tmp_path)
+        cluster = Slurm(tmp_path)
 
         def all_idle() -> bool | None:
             done = subprocess.run(
@@ -152,20 +152,20 @@ def slurm(hub: int, lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
             return True if done.stdout.split() == ["idle"] * len(NODES) else None
 
         wait_for("the nodes", all_idle, 60)
-        yield found
-        if found.job:
-            found("scancel", found.job)
+        yield cluster
+        if cluster.job:
+            cluster("scancel", cluster.job)
             wait_for(
-                "an empty queue", lambda: True if not found("squeue", "--noheader") else None, 60
+                "an empty queue", lambda: True if not cluster("squeue", "--noheader") else None, 60
             )
 
 
 def test_an_array_goes_on_where_slurm_takes_its_nodes(
     lab: Lab, slurm: Slurm, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def say(what: str, seconds: float) -> None:
+    def say(message: str, seconds: float) -> None:
         with capsys.disabled():
-            print(f"    {what:60} {seconds:5.1f} s, load {os.getloadavg()[0]:.1f}", flush=True)
+            print(f"    {message:60} {seconds:5.1f} s, load {os.getloadavg()[0]:.1f}", flush=True)
 
     def worker(task: str) -> str:
         """Return the name of the worker of a task of the array: each has a job id of its own."""

@@ -58,8 +58,8 @@ def test_a_service_is_lost_and_restored(tmp_path: Path, request: pytest.FixtureR
         return counts.get("render", {}).get("counts", {}).get("succeeded", 0) >= 5 or None
 
     wait_for("the first pictures", is_half_done, 200)
-    shown = run(block("stickslip backup /backup"), data, backup)
-    assert " files, " in shown
+    result = run(block("stickslip backup /backup"), data, backup)
+    assert " files, " in result
     assert service.process is not None
     service.process.send_signal(signal.SIGKILL)
     service.process.wait()

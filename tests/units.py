@@ -24,21 +24,21 @@ RUN = Path("/run/units")
 
 def settings_of(unit: Path) -> dict[str, list[str]]:
     """Return the values of each key of the section Service, in their order."""
-    found: dict[str, list[str]] = {}
+    settings: dict[str, list[str]] = {}
     section = ""
     for line in unit.read_text().splitlines():
         if line.startswith("["):
             section = line
         elif section == "[Service]" and "=" in line and not line.startswith("#"):
             key, _, value = line.partition("=")
-            found.setdefault(key, []).append(value)
-    return found
+            settings.setdefault(key, []).append(value)
+    return settings
 
 
 def environment_of(settings: dict[str, list[str]]) -> dict[str, str]:
     """Return the environment of a unit: that of systemd, its own, and that of its files."""
     user = pwd.getpwnam(settings["User"][0])
-    found = {"PATH": "/usr/local/bin:/usr/bin:/bin", "HOME": user.pw_dir, "USER": user.pw_name}
+    variables = {"PATH": "/usr/local/bin:/usr/bin:/bin", "HOME": user.pw_dir, "USER": user.pw_name}
     lines = list(settings.get("Environment", []))
     for name in settings.get("EnvironmentFile", []):
         path = Path(name.removeprefix("-"))
@@ -47,8 +47,8 @@ def environment_of(settings: dict[str, list[str]]) -> dict[str, str]:
     for line in lines:
         if "=" in line and not line.startswith("#"):
             key, _, value = line.partition("=")
-            found[key] = value
-    return found
+            variables[key] = value
+    return variables
 
 
 def command_of(settings: dict[str, list[str]], environment: dict[str, str]) -> list[str]:

@@ -179,7 +179,7 @@ def test_values_that_hardly_change_have_a_limit_and_no_order(
 
 def test_there_are_twelve_experiments_with_three_resolutions() -> None:
     assert len(experiments.EXPERIMENTS) == 12
-    assert {len(one.cells) for one in experiments.EXPERIMENTS.values()} == {3}
+    assert {len(experiment.cells) for experiment in experiments.EXPERIMENTS.values()} == {3}
 
 
 @pytest.mark.parametrize(

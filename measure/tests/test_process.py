@@ -33,7 +33,7 @@ from stickslip_sim_core.protocols.inclined_plane import OnSlope
 
 Adapter = Callable[..., Program]
 
-OWN = Program(Path(adapters.__file__).with_name("stickslip.py"))
+STICKSLIP = Program(Path(adapters.__file__).with_name("stickslip.py"))
 DOWN = np.array([0.0, 0.0, -GRAVITY])
 MU = 0.3
 
@@ -126,7 +126,7 @@ def test_slow_is_not_hanging(falling: Adapter, tmp_path: Path) -> None:
 
 def test_an_interpreter_that_does_not_exist(tmp_path: Path) -> None:
     with pytest.raises(SetupError, match="/nowhere/python does not start: No such file"):
-        fall(Program(OWN.adapter, "/nowhere/python"), tmp_path / "log")
+        fall(Program(STICKSLIP.adapter, "/nowhere/python"), tmp_path / "log")
 
 
 def test_files_of_the_package_hide_no_module_of_the_simulator(
@@ -157,7 +157,7 @@ def test_the_core_by_its_adapter_gives_the_slope_of_the_protocol(tmp_path: Path)
         force_scale=0.1 * scene.density * scene.cell**2 * GRAVITY,
     )
     protocol = OnSlope(direct, scene.start, MU, MU, np.ones(len(scene.start), dtype=bool))
-    with AdapterProcess(OWN, tmp_path / "log", 60.0) as process:
+    with AdapterProcess(STICKSLIP, tmp_path / "log", 60.0) as process:
         remote = OnSlope(
             RemoteCloth(Simulation(process, scene, "default"), certified),  # type: ignore[arg-type]
             scene.start,

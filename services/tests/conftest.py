@@ -90,18 +90,20 @@ def empty_database(
     database: str, tmp_path: Path, request: pytest.FixtureRequest
 ) -> Iterator[Callable[[], Database]]:
     """Makes databases without tables."""
-    made: list[Database] = []
+    databases: list[Database] = []
 
     def make() -> Database:
         url = None if database == "sqlite" else request.getfixturevalue("postgresql").empty()
-        made.append(
-            connect(Settings.chosen(data=tmp_path / str(len(made)), durable=False, database=url))
+        databases.append(
+            connect(
+                Settings.chosen(data=tmp_path / str(len(databases)), durable=False, database=url)
+            )
         )
-        return made[-1]
+        return databases[-1]
 
     yield make
-    for one in made:
-        one.close()
+    for database_ in databases:
+        database_.close()
 
 
 @pytest.fixture(autouse=True)
@@ -138,10 +140,10 @@ def context(settings: Settings, clock: ManualClock, migrated_file: Path) -> Iter
     if settings.database is None:
         settings.data.mkdir()
         copyfile(migrated_file, settings.database_path)
-    made = Context.open(settings, clock)
-    start(made)
-    yield made
-    made.close()
+    opened = Context.open(settings, clock)
+    start(opened)
+    yield opened
+    opened.close()
 
 
 @pytest.fixture

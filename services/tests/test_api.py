@@ -107,13 +107,13 @@ BAD_SPECS: dict[str, tuple[Any, str]] = {
 }
 
 
-@pytest.mark.parametrize("what", BAD_SPECS)
+@pytest.mark.parametrize("case", BAD_SPECS)
 @pytest.mark.parametrize("path", ["/v1/jobs", "/v1/jobs:validate"])
 def test_a_bad_spec_is_refused_with_its_place(
-    untouched: tuple[httpx.Client, PretendWorker], what: str, path: str
+    untouched: tuple[httpx.Client, PretendWorker], case: str, path: str
 ) -> None:
     client, worker = untouched
-    spec, pointer = BAD_SPECS[what]
+    spec, pointer = BAD_SPECS[case]
     response = client.post(path, content=json.dumps(spec), headers=JSON)
     document = problem(response, 422, "validation_failed")
     assert any(
@@ -137,12 +137,12 @@ BAD_BODIES = {
 }
 
 
-@pytest.mark.parametrize("what", BAD_BODIES)
+@pytest.mark.parametrize("case", BAD_BODIES)
 @pytest.mark.parametrize("path", ["/v1/jobs", "/v1/worker/report"])
 def test_a_body_that_is_not_json_is_refused(
-    untouched: tuple[httpx.Client, PretendWorker], what: str, path: str
+    untouched: tuple[httpx.Client, PretendWorker], case: str, path: str
 ) -> None:
-    problem(untouched[0].post(path, content=BAD_BODIES[what], headers=JSON), 400, "malformed_body")
+    problem(untouched[0].post(path, content=BAD_BODIES[case], headers=JSON), 400, "malformed_body")
 
 
 def test_a_key_twice_is_refused_in_a_message_that_is_right_otherwise(
@@ -258,11 +258,11 @@ def test_a_request_id_is_echoed(client: httpx.Client) -> None:
 def test_a_job_is_accepted_and_shown(client: httpx.Client, worker: PretendWorker) -> None:
     response = client.post("/v1/jobs", json=rods(name="mine"))
     assert response.status_code == 202
-    shown = client.get(response.headers["location"])
-    assert shown.json() == response.json()
+    detail = client.get(response.headers["location"])
+    assert detail.json() == response.json()
     worker.work()
     assert client.get(response.headers["location"]).json()["state"] == "succeeded"
-    assert client.post(f"/v1/jobs/{shown.json()['id']}:cancel").status_code == 409
+    assert client.post(f"/v1/jobs/{detail.json()['id']}:cancel").status_code == 409
 
 
 def test_a_problem_has_a_type_and_a_title_of_its_own(client: httpx.Client) -> None:
@@ -325,17 +325,17 @@ def test_validate_counts_what_is_there(app: FastAPI, client: httpx.Client) -> No
 
 
 def test_pages_stay_what_they_are_while_jobs_come(client: httpx.Client) -> None:
-    made = [
+    submitted = [
         client.post("/v1/jobs", json=rods(name=f"job{number}")).json()["id"] for number in range(5)
     ]
     page = client.get("/v1/jobs", params={"page_size": 2}).json()
-    seen = [item["id"] for item in page["items"]]
+    listed = [item["id"] for item in page["items"]]
     while page["next_page_token"]:
         client.post("/v1/jobs", json=rods())
         query = {"page_size": 2, "page_token": page["next_page_token"]}
         page = client.get("/v1/jobs", params=query).json()
-        seen += [item["id"] for item in page["items"]]
-    assert seen == made[::-1]
+        listed += [item["id"] for item in page["items"]]
+    assert listed == submitted[::-1]
 
 
 @pytest.mark.parametrize("token", ["x", "%", "LTE", "MTIzNDU2Nzg5MDEyMzQ1Njc4OTA", "é", ""])
@@ -381,8 +381,8 @@ def test_workers_are_listed(
 ) -> None:
     client.post("/v1/jobs", json=rods())
     worker.lease(simulate=3)
-    (shown,) = client.get("/v1/workers").json()
-    assert (shown["name"], shown["alive"], shown["leased"]) == ("pretend", True, 3)
+    (entry,) = client.get("/v1/workers").json()
+    assert (entry["name"], entry["alive"], entry["leased"]) == ("pretend", True, 3)
     clock.advance(60)
     assert client.get("/v1/workers").json()[0]["alive"] is False
 
@@ -496,9 +496,9 @@ def test_workers_show_what_they_run_and_how_far_it_is(
         "/v1/worker/heartbeat",
         json={"worker_id": worker.id, "leases": [state], "condition": {"slots": 2}},
     ).raise_for_status()
-    (shown,) = client.get("/v1/workers").json()
-    assert shown["leased"] == 2
-    (task,) = shown["running"]
+    (entry,) = client.get("/v1/workers").json()
+    assert entry["leased"] == 2
+    (task,) = entry["running"]
     assert (task["task_id"], task["stage"], task["job"], task["frames"]) == (
         running.task_id,
         "simulate",

@@ -31,8 +31,8 @@ pytestmark = pytest.mark.databases
 def lines(context: Context, subject: str | None = None) -> list[tuple[str, str, dict[str, Any]]]:
     """Return who did what, the oldest first."""
     with context.database.read() as connection:
-        found = audit_log.read(connection, subject=subject)
-    return [(line.actor, line.action, line.details) for line in reversed(found)]
+        entries = audit_log.read(connection, subject=subject)
+    return [(line.actor, line.action, line.details) for line in reversed(entries)]
 
 
 def test_every_change_of_a_job_has_its_line(context: Context, worker: PretendWorker) -> None:
@@ -76,8 +76,8 @@ def test_keys_and_webhooks_have_lines(context: Context) -> None:
         )
         retry_webhook(connection, hook, 4.0)
         delete_webhook(connection, hook, 5.0)
-    found = lines(context)
-    assert [(actor, action) for actor, action, _ in found] == [
+    entries = lines(context)
+    assert [(actor, action) for actor, action, _ in entries] == [
         ("user ada", action)
         for action in (
             "key.create",
@@ -87,8 +87,8 @@ def test_keys_and_webhooks_have_lines(context: Context) -> None:
             "webhook.delete",
         )
     ]
-    assert found[0][2] == {"name": "bert", "scopes": ["read", "submit"], "project": ""}
-    assert not any(secret in json.dumps(found) for secret in (secret, sign))
+    assert entries[0][2] == {"name": "bert", "scopes": ["read", "submit"], "project": ""}
+    assert not any(secret in json.dumps(entries) for secret in (secret, sign))
 
 
 @pytest.mark.parametrize("change", [update(audit_rows).values(actor="nobody"), delete(audit_rows)])
@@ -110,22 +110,24 @@ def test_requests_are_told_apart_by_their_keys(
     application = make_app(settings.model_copy(update={"require_keys": True}))
     with serving(application) as url:
         with application.state.context.database.write() as connection:
-            made = [
+            keys = [
                 create_key(connection, name, [Scope.submit], time.time())
                 for name in ("ada", "bert")
             ]
         time.sleep(1.1)  # so long a key may take to count
         for _ in range(3):
-            for _, secret in made:
+            for _, secret in keys:
                 headers = {"Authorization": f"Bearer {secret}"}
                 answer = httpx.post(
                     f"{url}/v1/jobs", json=rods(), headers=headers, trust_env=False, timeout=30
                 )
                 assert answer.status_code == 202, answer.text
-        found = [
+        entries = [
             actor for actor, action, _ in lines(application.state.context) if action == "job.submit"
         ]
-    assert found == [f"{made[number % 2][0]} {('ada', 'bert')[number % 2]}" for number in range(6)]
+    assert entries == [
+        f"{keys[number % 2][0]} {('ada', 'bert')[number % 2]}" for number in range(6)
+    ]
 
 
 def test_the_command_line_shows_it(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -142,7 +144,7 @@ def test_the_command_line_shows_it(settings: Settings, monkeypatch: pytest.Monke
         job = httpx.post(f"{url}/v1/jobs", json=rods(), trust_env=False, timeout=30).json()["id"]
     (line,) = (json.loads(text) for text in cli("audit-log", job, "--json").stdout.splitlines())
     assert (line["actor"], line["action"], line["subject"]) == (NOBODY, "job.submit", job)
-    shown = cli("audit-log").stdout
-    assert "user ada" in shown
-    assert "key.create" in shown
+    output = cli("audit-log").stdout
+    assert "user ada" in output
+    assert "key.create" in output
     assert len(cli("audit-log", "--json", "--limit", "1").stdout.splitlines()) == 1

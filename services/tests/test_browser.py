@@ -102,7 +102,7 @@ def paths(app: FastAPI, worker: PretendWorker) -> list[str]:
         for upload in uploads
     ]
     certificates = [f"/certificates/{entry.digest}" for entry in entries]
-    shown = [
+    addresses = [
         page
         for job, clip in clips
         for page in (job, clip, f"{clip}/samples/1", f"{clip}/samples/0?beside=1")
@@ -120,7 +120,7 @@ def paths(app: FastAPI, worker: PretendWorker) -> list[str]:
         *certificates,
         "/workers",
         "/docs",
-        *shown,
+        *addresses,
         f"{jobs[0]}/tasks/{worker.finished_ids[0]}",
         "/submit",
         "/submit?kind=cloth_drag",
@@ -251,8 +251,8 @@ def test_every_page_is_whole(browser: Any, url: str, paths: list[str], width: in
         for scheme, options in SCHEMES[width].items():
             page.emulate_media(color_scheme=scheme)
             violations = page.evaluate(f"axe.run({options})")["violations"]
-            found = [(v["id"], v["impact"], v["nodes"][0]["html"]) for v in violations]
-            assert found == [], (path, scheme)
+            broken_rules = [(v["id"], v["impact"], v["nodes"][0]["html"]) for v in violations]
+            assert broken_rules == [], (path, scheme)
     assert faults == []
     context.close()
 
@@ -299,22 +299,22 @@ def test_a_sample_in_space_turns_and_follows_the_cursor(
     canvas = page.locator(".space canvas")
     page.get_by_role("button", name="Show it in three dimensions").click()
     page.locator(".space[data-drawn]").wait_for()
-    seen = [canvas.screenshot()]
+    pictures = [canvas.screenshot()]
     canvas.focus()
     page.keyboard.press("Shift+ArrowRight")
-    seen.append(canvas.screenshot())
+    pictures.append(canvas.screenshot())
     page.locator(".time").focus()
     page.keyboard.press("End")
-    seen.append(canvas.screenshot())
+    pictures.append(canvas.screenshot())
     box = canvas.bounding_box()
     page.mouse.move(box["x"] + 50, box["y"] + 50)
     page.mouse.down()
     page.mouse.move(box["x"] + 150, box["y"] + 80)
     page.mouse.up()
-    seen.append(canvas.screenshot())
+    pictures.append(canvas.screenshot())
     page.emulate_media(color_scheme="dark")
-    seen.append(canvas.screenshot())
-    assert len(set(seen)) == len(seen)
+    pictures.append(canvas.screenshot())
+    assert len(set(pictures)) == len(pictures)
     assert "Cells of the floor" in page.locator(".space .scale").inner_text()
     page.close()
 

@@ -61,10 +61,10 @@ def cloth(**rest: Any) -> Any:
 
 
 def manifest_of(context: Context, job: Any) -> Manifest:
-    shown = show_job(context, job.id)
-    assert shown.state is JobState.succeeded, shown.message
-    assert shown.dataset is not None
-    return Manifest.model_validate_json(context.store.read(shown.dataset.manifest))
+    detail = show_job(context, job.id)
+    assert detail.state is JobState.succeeded, detail.message
+    assert detail.dataset is not None
+    return Manifest.model_validate_json(context.store.read(detail.dataset.manifest))
 
 
 @pytest.fixture
@@ -77,9 +77,13 @@ class TestTheRule:
         refusal = r"^preset 'certified' .* `stickslip certify --preset certified`"
         with pytest.raises(PresetNotCertifiedError, match=refusal):
             submit_job(context, cloth(), None)
-        told = validate_spec(context, cloth())  # which counts all the same
-        assert re.match(refusal, told.refusal or "")
-        assert (told.sample_count, told.certificate, told.cached_count) == (2, None, None)
+        estimate = validate_spec(context, cloth())  # which counts all the same
+        assert re.match(refusal, estimate.refusal or "")
+        assert (estimate.sample_count, estimate.certificate, estimate.cached_count) == (
+            2,
+            None,
+            None,
+        )
         added = register_certificate(context.database, context.store, upload(), context.clock())
         assert validate_spec(context, cloth()).certificate == added.digest
         job = submit_job(context, cloth(), None)
@@ -196,9 +200,9 @@ class TestTheRule:
         early = submit_job(context, cloth(), None)
         lenient = submit_job(context, cloth(allow_uncertified=True), None)
         PretendWorker(DirectApi(context), context.store, kinds=KINDS).register()
-        shown = show_job(context, early.id)  # type: ignore[union-attr]  # no replay
-        assert (shown.state, shown.reason) == (JobState.failed, Reason.preset_not_certified)
-        assert "stickslip certify" in shown.message
+        detail = show_job(context, early.id)  # type: ignore[union-attr]  # no replay
+        assert (detail.state, detail.reason) == (JobState.failed, Reason.preset_not_certified)
+        assert "stickslip certify" in detail.message
         assert show_job(context, lenient.id).state is JobState.queued  # type: ignore[union-attr]
 
 
@@ -218,8 +222,8 @@ class TestHttp:
             assert entry == again.json()
             assert entry == first.json() | {"created_at": entry["created_at"]}
             assert first.headers["location"] == entry["href"]
-            shown = client.get(entry["href"])
-            assert Certificate.model_validate_json(shown.content).digest == entry["digest"]
+            response = client.get(entry["href"])
+            assert Certificate.model_validate_json(response.content).digest == entry["digest"]
             for path in (
                 "/v1/certificates/abc",
                 f"/v1/certificates/{'0' * 64}",

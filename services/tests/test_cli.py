@@ -59,9 +59,9 @@ def test_a_grid_becomes_a_verified_directory(
     assert "published ds-" in submitted.stdout
     assert "succeeded_with_rejects" in submitted.stdout
     assert cli("watch", job).exit_code == 0
-    shown = cli("show", job).stdout
-    assert "3 of 4 samples (75.0%)" in shown
-    assert "it [fell] off" in shown
+    output = cli("show", job).stdout
+    assert "3 of 4 samples (75.0%)" in output
+    assert "it [fell] off" in output
     assert json.loads(cli("show", job, "--json").stdout)["state"] == "succeeded_with_rejects"
     assert job in cli("jobs").stdout
     assert json.loads(cli("jobs", "--json").stdout)[0]["id"] == job

@@ -42,23 +42,23 @@ def test_a_job_from_its_spec_to_its_files(app: FastAPI, tmp_path: Path) -> None:
         other, another = client.submit(rods(gamma=(5.0,))), client.submit(rods(gamma=(5.0,)))
         assert other.id != another.id  # by default each call has a new key
         client.cancel(other.id)
-        assert [shown.id for shown in client.jobs()] == [another.id, other.id, job.id]
+        assert [listed.id for listed in client.jobs()] == [another.id, other.id, job.id]
         worker.work()
         ended = client.wait(job.id)
         assert ended.state == JobState.succeeded
         events = list(client.events(job.id))
         assert isinstance(events[-1], JobStateEvent)
-        (made,) = [event for event in events if isinstance(event, DatasetPublishedEvent)]
+        (published,) = [event for event in events if isinstance(event, DatasetPublishedEvent)]
         lines = [str(event) for event in events]
         assert lines[-1] == "succeeded"
-        assert f"published {made.dataset.dataset}:v1" in lines
+        assert f"published {published.dataset.dataset}:v1" in lines
         assert all("\n" not in line and len(line) < 120 for line in lines)
         assert (
             len(list(client.samples(job.id)))
             == len(client.request("GET", f"/v1/jobs/{job.id}/previews").json())
             == 4
         )
-        pulled = pull(client, made.dataset.dataset, 1, tmp_path / "dataset")
+        pulled = pull(client, published.dataset.dataset, 1, tmp_path / "dataset")
         assert pulled.downloaded_files == pulled.files
         with pytest.raises(ProblemError, match="there is no job"):
             client.job("job-0")
@@ -69,8 +69,10 @@ def test_asynchronous_programs_call_the_client_in_threads(app: FastAPI) -> None:
     async def use(url: str) -> None:
         with Client(url) as client:
             specs = [rods(gamma=(value,)) for value in (5.0, 6.0, 7.0)]
-            made = await asyncio.gather(*(asyncio.to_thread(client.submit, spec) for spec in specs))
-            assert {job.id for job in made} == {
+            submitted = await asyncio.gather(
+                *(asyncio.to_thread(client.submit, spec) for spec in specs)
+            )
+            assert {job.id for job in submitted} == {
                 job.id for job in await asyncio.to_thread(list, client.jobs())
             }
 

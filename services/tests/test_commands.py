@@ -63,13 +63,13 @@ def test_narrow_terminals_show_fewer_columns_and_break_no_word(
         ("ds-1", "b", output.Styled("failed", "red")),
     ]
     output.print_table(("dataset", "name", "state"), rows)
-    shown = capsys.readouterr()
-    assert [line.split() for line in click.unstyle(shown.out).splitlines()] == [
+    captured = capsys.readouterr()
+    assert [line.split() for line in click.unstyle(captured.out).splitlines()] == [
         ["dataset", "name"],
         ["ds-0123456789abcdef:v1", "a-long-name"],
         ["ds-1", "b"],
     ]
-    assert "not shown in 40 columns: state; --json shows all" in " ".join(shown.err.split())
+    assert "not shown in 40 columns: state; --json shows all" in " ".join(captured.err.split())
     output.print_table(
         ("slot", "message"),
         [("3", "its centreline leaves the frame by 12 px at the left")],

@@ -125,11 +125,11 @@ def test_quick_rejections_do_not_shorten_the_time_left(
     job = submit(context, gamma=tuple(1.0 + value for value in range(12)), phi1=(1.0,))
     for lease in worker.lease(simulate=12):
         finish(worker, lease, 0.1)
-    *quick, one, two, three = worker.lease(render=6)
+    *quick, first, two, three = worker.lease(render=6)
     out = rejection().model_copy(update={"wall_seconds": 0.005, "call_seconds": 0.005})
     worker.report(*((lease, out) for lease in quick))
     assert show_job(context, job).progress.eta is None
-    for lease in (one, two, three):
+    for lease in (first, two, three):
         finish(worker, lease, 100.0)
     eta = show_job(context, job).progress.eta
     assert eta is not None
@@ -341,27 +341,29 @@ def test_frames_of_running_simulations_are_shown(context: Context, worker: Prete
 
     def beat(*frames: tuple[Lease, tuple[int, int] | None]) -> None:
         states = [
-            LeaseState(task_id=lease.task_id, token=lease.token, started=True, frames=told)
-            for lease, told in frames
+            LeaseState(task_id=lease.task_id, token=lease.token, started=True, frames=shown_frames)
+            for lease, shown_frames in frames
         ]
         heartbeat(
             context,
             Heartbeat(worker_id=worker.id, leases=tuple(states), condition=worker.condition),
         )
 
-    def told() -> tuple[int, int] | None:
+    def shown_frames() -> tuple[int, int] | None:
         return show_job(context, job_id).progress.stages[Stage.simulate].frames
 
-    assert told() is None
+    assert shown_frames() is None
     beat((first, (30, 300)), (second, (100, 300)))
-    assert told() == (130, 600)
+    assert shown_frames() == (130, 600)
     beat((first, (60, 300)), (second, None))
-    assert told() == (60, 300)
+    assert shown_frames() == (60, 300)
     worker.finish(first)
-    assert told() is None  # what has ended does not count, though the worker has told nothing new
+    assert (
+        shown_frames() is None
+    )  # what has ended does not count, though the worker has told nothing new
     beat((second, (100, 300)))
     worker.register().start(*worker.lease(simulate=2))
-    assert told() is None  # what an earlier session has told does not count either
+    assert shown_frames() is None  # what an earlier session has told does not count either
 
 
 def test_no_time_is_told_before_enough_was_measured(

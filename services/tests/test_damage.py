@@ -74,15 +74,15 @@ def flip(context: Context, rng: random.Random) -> str:
     """Flip a bit of a value that a dataset is made from; return where."""
     table = rng.choice([tasks, samples, samples, tasks, jobs])
     column = table.c[rng.choice(COLUMNS[table])]
-    made = (
+    conditions = (
         [] if table is not tasks else [tasks.c.state.in_((TaskState.succeeded, TaskState.rejected))]
     )
     if column.name in ("key", "payload", "payload_digest"):
-        made = []
+        conditions = []
     with context.database.write() as connection:
         rowid = {tasks: "seq", jobs: "seq", samples: "slot"}[table]
         rows = connection.execute(
-            select(table.c[rowid], column).where(column.is_not(None), *made)
+            select(table.c[rowid], column).where(column.is_not(None), *conditions)
         ).all()
         if not rows:
             return "nothing"
@@ -142,15 +142,15 @@ def outcome_of_a_flip(
         listed = None
     sweep(context)
     worker = pretend(context)
-    shown = ended(context, worker, clock, job)
-    if shown.state == JobState.failed:
-        assert shown.reason == Reason.damaged_row, (where, shown.reason, shown.message)
-        assert "is damaged in the database. Restore a backup" in shown.message, where
+    detail = ended(context, worker, clock, job)
+    if detail.state == JobState.failed:
+        assert detail.reason == Reason.damaged_row, (where, detail.reason, detail.message)
+        assert "is damaged in the database. Restore a backup" in detail.message, where
         assert where != "nothing"
         manifest = None
         resubmit(context, worker, clock, right)
     else:
-        manifest = shown.manifest
+        manifest = detail.manifest
     with context.database.read() as connection:
         faults = violations(connection)
         # A damaged sample of the first job stays as it is.
@@ -166,12 +166,12 @@ def resubmit(context: Context, worker: PretendWorker, clock: ManualClock, right:
     """Submit the spec of a job that failed for damage again: it gets the right dataset."""
     for _ in range(3):
         again = submit_job(context, parsed(SPEC), None)
-        shown = ended(context, worker, clock, again.id)  # type: ignore[union-attr]
-        if shown.state != JobState.failed:
+        detail = ended(context, worker, clock, again.id)  # type: ignore[union-attr]
+        if detail.state != JobState.failed:
             break
-        assert shown.reason == Reason.damaged_row, shown.message
+        assert detail.reason == Reason.damaged_row, detail.message
     # A damaged key of the publish task gives the dataset another version.
-    assert shown.manifest == right[0] or shown.version == 2, shown.message
+    assert detail.manifest == right[0] or detail.version == 2, detail.message
 
 
 @pytest.mark.slow
@@ -179,10 +179,10 @@ def test_no_flip_in_a_row_is_silent(tmp_path: Path, clock: ManualClock) -> None:
     job = half_made(tmp_path / "half", clock)
     right = outcome_of_a_flip(tmp_path / "right", tmp_path / "half", job, 0, None)
     assert None not in right
-    found = [
+    outcomes = [
         outcome_of_a_flip(tmp_path / str(n), tmp_path / "half", job, n, right) for n in range(FLIPS)
     ]
-    assert any(manifest is None for manifest, _ in found)
+    assert any(manifest is None for manifest, _ in outcomes)
 
 
 @pytest.mark.parametrize("stage", ["render", "pack"])
@@ -207,22 +207,22 @@ def test_a_bug_in_composing_a_lease_is_called_a_bug(
     assert "TypeError: planted" in caplog.text
     with context.database.read() as connection:
         (row,) = connection.execute(select(tasks).where(tasks.c.state == TaskState.failed))
-        shown: Any = find_job(connection, job.id)  # type: ignore[union-attr]
+        job_row: Any = find_job(connection, job.id)  # type: ignore[union-attr]
         assert violations(connection) == []
     assert row.reason == Reason.internal_error
     assert "damaged" not in row.message
-    assert shown.state == JobState.failed
-    assert "internal_error" in shown.message
-    assert f"/v1/tasks/{stage}-" in shown.message  # the reproducer
-    assert "damaged" not in shown.message
+    assert job_row.state == JobState.failed
+    assert "internal_error" in job_row.message
+    assert f"/v1/tasks/{stage}-" in job_row.message  # the reproducer
+    assert "damaged" not in job_row.message
 
     # Once the bug is mended, the next submission goes on.
     monkeypatch.undo()
     again = submit_job(context, parsed(rods()), None)
     worker.work()
     with context.database.read() as connection:
-        shown = find_job(connection, again.id)  # type: ignore[union-attr]
-    assert shown.state == JobState.succeeded
+        job_row = find_job(connection, again.id)  # type: ignore[union-attr]
+    assert job_row.state == JobState.succeeded
 
 
 def test_dependents_wait_again_for_a_damaged_result(

@@ -91,14 +91,14 @@ def test_a_stream_goes_on_after_the_last_event_that_was_seen(
 
 def test_news_arrive_while_they_happen(client: httpx.Client, worker: PretendWorker) -> None:
     job = submit(client)
-    seen: list[ServerSentEvent] = []
+    received: list[ServerSentEvent] = []
     thread = threading.Thread(target=worker.work)
     for event in follow(client, job):
-        seen.append(event)
+        received.append(event)
         if event.event == "job.progress" and thread.ident is None:
             thread.start()
     thread.join()
-    assert words(seen) == ["queued", "running", "succeeded"]
+    assert words(received) == ["queued", "running", "succeeded"]
 
 
 def test_a_quiet_stream_says_that_it_lives_and_holds_no_connection(

@@ -23,8 +23,8 @@ def submit_shared(context: Context) -> list[str]:
     """Submit a job in each of the projects; half of the tasks of each are the same for all."""
     submitted: list[str] = []
     for number in range(PROJECTS):
-        own = [1000.0 * (1 + number) + index for index in range(SAMPLES // 2)]
-        gamma = [*(1.0 + index for index in range(SAMPLES // 2)), *own]
+        of_project = [1000.0 * (1 + number) + index for index in range(SAMPLES // 2)]
+        gamma = [*(1.0 + index for index in range(SAMPLES // 2)), *of_project]
         job = submit_job(context, parsed(rods(gamma=gamma, phi1=[1.0])), None)
         submitted.append(job.id)  # type: ignore[union-attr]
         with context.database.write() as connection:
@@ -68,16 +68,16 @@ def test_what_does_not_divide_evenly_goes_round(context: Context, worker: Preten
 def test_pause_and_cancel_of_one_leave_the_others_alone(
     context: Context, worker: PretendWorker
 ) -> None:
-    paused, cancelled, *others = submit_shared(context)
+    paused, cancelled, *running = submit_shared(context)
     assert pause_job(context, paused).state is JobState.paused
     assert cancel_job(context, cancelled).state is JobState.cancelled
-    leases = worker.lease(simulate=10 * len(others))
+    leases = worker.lease(simulate=10 * len(running))
     assert set(leased_by_project(context).values()) == {10}
-    assert len(leased_by_project(context)) == len(others)
+    assert len(leased_by_project(context)) == len(running)
     worker.finish(*leases)
     assert resume_job(context, paused).state is JobState.queued
     worker.work()
-    for job in (paused, *others):
+    for job in (paused, *running):
         assert show_job(context, job).state is JobState.succeeded
     with context.database.read() as connection:
         assert violations(connection) == []

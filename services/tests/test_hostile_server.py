@@ -107,10 +107,10 @@ def endless(block: bytes) -> Answer:
 @pytest.fixture(scope="module")
 def honest(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, bytes], Manifest]:
     """The answers of a real coordinator for a version, by path, and its manifest."""
-    made = make_app(Settings(data=tmp_path_factory.mktemp("origin"), durable=False))
+    app = make_app(Settings(data=tmp_path_factory.mktemp("origin"), durable=False))
     target = tmp_path_factory.mktemp("pulled") / "d"
-    with serving(made) as url, Client(url) as client:
-        context = made.state.context
+    with serving(app) as url, Client(url) as client:
+        context = app.state.context
         worker = PretendWorker(DirectApi(context), context.store, whole=True).register()
         job = client.submit(rods(gamma=(1.0, 2.0)))
         worker.work()

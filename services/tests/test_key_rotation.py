@@ -109,10 +109,10 @@ def test_an_expired_worker_key_is_replaced_at_the_next_start(tmp_path: Path) -> 
 
 
 def test_expiry_and_rotation_from_the_command_line(tmp_path: Path) -> None:
-    made = run(tmp_path, "create", "a laptop", "--scope", "read", "--days", "90")
-    assert made.exit_code == 0, made.output
+    result = run(tmp_path, "create", "a laptop", "--scope", "read", "--days", "90")
+    assert result.exit_code == 0, result.output
     date = time.strftime("%Y-%m-%d", time.gmtime(time.time() + 90 * DAY))
-    assert f"and expires at {date}" in made.stderr
+    assert f"and expires at {date}" in result.stderr
     key_id = run(tmp_path, "list").stdout.splitlines()[1].split()[0]
     rotated = run(tmp_path, "rotate", key_id, "--overlap", "2", "--days", "30")
     assert rotated.exit_code == 0, rotated.output
@@ -126,6 +126,6 @@ def test_expiry_and_rotation_from_the_command_line(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("days", ["0", "nan", "1e9", "-1", "soon"])
 def test_a_lifetime_out_of_range_is_refused(tmp_path: Path, days: str) -> None:
-    made = run(tmp_path, "create", "x", "--scope", "read", "--days", days)
-    assert made.exit_code == 2
-    assert "must be a number of days, 0.01 to 36500" in made.stderr
+    result = run(tmp_path, "create", "x", "--scope", "read", "--days", days)
+    assert result.exit_code == 2
+    assert "must be a number of days, 0.01 to 36500" in result.stderr

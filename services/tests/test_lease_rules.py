@@ -109,9 +109,14 @@ def test_unstarted_tasks_of_a_lost_worker_are_not_charged(
     worker.start(started)
     clock.advance(31)
     sweep(context)
-    lost, kept = row(context, started.task_id), row(context, unstarted.task_id)
+    lost, waiting = row(context, started.task_id), row(context, unstarted.task_id)
     assert (lost.state, lost.attempts, lost.losses, lost.tries) == (TaskState.pending, 1, 1, 0)
-    assert (kept.state, kept.attempts, kept.losses, kept.tries) == (TaskState.pending, 0, 0, 0)
+    assert (waiting.state, waiting.attempts, waiting.losses, waiting.tries) == (
+        TaskState.pending,
+        0,
+        0,
+        0,
+    )
 
 
 def test_each_lease_of_a_task_has_a_higher_token(
@@ -223,10 +228,10 @@ def test_cancelling_stops_waiting_tasks_at_once_and_running_ones_with_the_heartb
     assert worker.lease() == ()
     assert worker.beat(running) == (running.task_id,)
     sweep(context)
-    shown = show_job(context, job_id)
-    assert shown.state is JobState.cancelled
-    assert (shown.progress.done, shown.progress.total) == (0, 11)  # nothing has a result
-    for stage in shown.progress.stages.values():
+    detail = show_job(context, job_id)
+    assert detail.state is JobState.cancelled
+    assert (detail.progress.done, detail.progress.total) == (0, 11)  # nothing has a result
+    for stage in detail.progress.stages.values():
         assert stage.counts.keys() == {TaskState.cancelled}
     with context.database.read() as connection:
         seq = find_job(connection, job_id).seq
@@ -310,7 +315,7 @@ def test_heartbeats_that_wait_are_answered_together(
 ) -> None:
     submit(context)
     other = PretendWorker(DirectApi(context), context.store, name="other").register()
-    (kept,), (lost,) = worker.lease(simulate=1), other.lease(simulate=1)
+    (renewed,), (lost,) = worker.lease(simulate=1), other.lease(simulate=1)
     other.report((lost, None))
     messages = [
         Heartbeat(
@@ -319,16 +324,16 @@ def test_heartbeats_that_wait_are_answered_together(
             condition=worker.condition,
         )
         for of, lease in (
-            (worker.id, kept),
+            (worker.id, renewed),
             (other.id, lost),
-            ("worker-nobody", kept),
-            (other.id, kept),
+            ("worker-nobody", renewed),
+            (other.id, renewed),
         )
     ]
     left = renew_leases(context, messages)
     assert left == [None, *(list(message.leases) for message in messages[1:])]
     for message, states, drop in zip(
-        messages[1:], left[1:], ((lost.task_id,), None, (kept.task_id,)), strict=True
+        messages[1:], left[1:], ((lost.task_id,), None, (renewed.task_id,)), strict=True
     ):
         assert states is not None
         if drop is None:
@@ -336,7 +341,7 @@ def test_heartbeats_that_wait_are_answered_together(
                 reconcile_leases(context, message, states)
         else:
             assert reconcile_leases(context, message, states).drop == drop
-    assert row(context, kept.task_id).owner == worker.id
+    assert row(context, renewed.task_id).owner == worker.id
 
 
 def test_calls_that_wait_are_gathered_and_fail_together() -> None:
@@ -362,8 +367,8 @@ def test_calls_that_wait_are_gathered_and_fail_together() -> None:
         results = await asyncio.gather(*waiting, return_exceptions=True)
         return [*results, await batcher.add(5)]
 
-    one, two, three, four, five = asyncio.run(use())
-    assert (one, five, calls) == (10, 50, [[1], [2, 3, 4], [5]])
+    earliest, two, three, four, five = asyncio.run(use())
+    assert (earliest, five, calls) == (10, 50, [[1], [2, 3, 4], [5]])
     assert isinstance(two, ValueError)
     assert isinstance(three, ValueError)
     assert isinstance(four, asyncio.CancelledError)

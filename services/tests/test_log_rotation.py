@@ -108,8 +108,8 @@ def test_nothing_is_lost_while_a_process_writes(tmp_path: Path) -> None:
         time.sleep(0.002)
     assert process.returncode == 0
     assert len(list(tmp_path.glob("x.log.*"))) > 3
-    found = written(log)
-    assert found == Counter(
+    lines_by_count = written(log)
+    assert lines_by_count == Counter(
         [f"line {number} of {process.pid}" for number in range(20_000)] + [f"end of {process.pid}"]
     )
 
@@ -173,10 +173,10 @@ def test_up_rotates_the_logs_of_its_children(
     finally:
         up.terminate()
         up.wait(100)
-    found = written(log)
-    assert set(found.values()) == {1}
-    for writer in {line.rpartition(" ")[2] for line in found}:
-        numbers = {int(line.split()[1]) for line in found if line.endswith(f" of {writer}")}
+    counts = written(log)
+    assert set(counts.values()) == {1}
+    for writer in {line.rpartition(" ")[2] for line in counts}:
+        numbers = {int(line.split()[1]) for line in counts if line.endswith(f" of {writer}")}
         assert numbers == set(range(len(numbers)))
 
 

@@ -63,7 +63,7 @@ def urls(settings: Settings) -> list[str]:
 @pytest.fixture
 def nodes(settings: Settings, urls: list[str]) -> Iterator[list[Node]]:
     place = settings.data.parent
-    made = []
+    started = []
     for name, url in zip("ab", urls, strict=False):
         words = [
             "--data",
@@ -73,7 +73,7 @@ def nodes(settings: Settings, urls: list[str]) -> Iterator[list[Node]]:
             "--store",
             settings.store_place,
         ]
-        made.append(Node(f"coordinator {name}", COORDINATOR, words, place / f"{name}.log"))
+        started.append(Node(f"coordinator {name}", COORDINATOR, words, place / f"{name}.log"))
     try:
         for name, url in zip("ab", urls * 2, strict=False):
             wait_until(lambda url=url: is_ready(url), seconds=PATIENCE)  # type: ignore[misc]
@@ -84,10 +84,10 @@ def nodes(settings: Settings, urls: list[str]) -> Iterator[list[Node]]:
                 settings.store_place,
                 url,
             ]
-            made.append(Node(f"worker {name}", WORKER, words, place / f"worker-{name}.log"))
-        yield made
+            started.append(Node(f"worker {name}", WORKER, words, place / f"worker-{name}.log"))
+        yield started
     finally:
-        for node in made:
+        for node in started:
             node.kill()
 
 

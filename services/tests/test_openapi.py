@@ -6,19 +6,19 @@ from pathlib import Path
 
 from stickslip_services.app import openapi_text
 
-made = cache(openapi_text)
+generated = cache(openapi_text)
 
 COMMITTED = Path(__file__).parents[2] / "docs" / "openapi.json"
 
 
 def test_the_committed_document_is_up_to_date() -> None:
-    assert COMMITTED.read_text() == made(), (
+    assert COMMITTED.read_text() == generated(), (
         "run: python -m stickslip_services.app --openapi > docs/openapi.json"
     )
 
 
 def test_every_reference_leads_somewhere() -> None:
-    document = json.loads(made())
+    document = json.loads(generated())
     names = set(document["components"]["schemas"])
     text = json.dumps(document)
     references = {part.split('"')[0] for part in text.split("#/components/schemas/")[1:]}
@@ -28,7 +28,7 @@ def test_every_reference_leads_somewhere() -> None:
 
 
 def test_every_route_names_its_problems() -> None:
-    document = json.loads(made())
+    document = json.loads(generated())
     for path, methods in document["paths"].items():
         for method, operation in methods.items():
             for status, response in operation["responses"].items():

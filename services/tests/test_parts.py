@@ -27,10 +27,10 @@ def origin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str,
 
     Of the first, slot n of 0 to 7 has gamma n, two slots to a shard.
     """
-    made = make_app(Settings(data=tmp_path_factory.mktemp("origin"), durable=False))
-    with serving(made) as url, Client(url) as client:
+    app = make_app(Settings(data=tmp_path_factory.mktemp("origin"), durable=False))
+    with serving(app) as url, Client(url) as client:
         worker = PretendWorker(
-            DirectApi(made.state.context), made.state.context.store, whole=True
+            DirectApi(app.state.context), app.state.context.store, whole=True
         ).register()
         ids = []
         for gamma in (GAMMAS, GAMMAS[:2]):

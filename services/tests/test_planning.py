@@ -63,7 +63,9 @@ def written(context: Context, job_id: str) -> tuple[Any, ...]:
             tasks.c[name]
             for name in ("key", "stage", "build", "preview", "cost_group", "waiting_on")
         ]
-        own = connection.execute(select(*columns).join(job_tasks, of_job[0]).where(of_job[1])).all()
+        tasks_of_job = connection.execute(
+            select(*columns).join(job_tasks, of_job[0]).where(of_job[1])
+        ).all()
         edges = connection.execute(
             select(tasks.c.key, needed.c.key)
             .join(task_dependencies, task_dependencies.c.task == tasks.c.seq)
@@ -75,7 +77,7 @@ def written(context: Context, job_id: str) -> tuple[Any, ...]:
             select(samples).where(samples.c.job == job).order_by(samples.c.slot)
         ).all()
     return (
-        sorted(map(tuple, own)),
+        sorted(map(tuple, tasks_of_job)),
         sorted(map(tuple, edges)),
         [
             (row.slot, row.key, names[row.simulate_task], names.get(row.render_task), row.split)
@@ -87,12 +89,12 @@ def written(context: Context, job_id: str) -> tuple[Any, ...]:
 def planned(document: dict[str, Any]) -> tuple[Any, ...]:
     """Return what `written` gives of a job of which nothing was done before."""
     plan = expand(parsed(document), PlanInputs(BUILDS, None), previews=24)
-    own = [
+    tasks_of_job = [
         (key, task.stage, task.build, task.preview, task.cost_group, len(task.depends_on))
         for key, task in plan.tasks.items()
     ]
     edges = [(key, needed) for key, task in plan.tasks.items() for needed in task.depends_on]
-    return sorted(own), sorted(edges), [sample[:-1] for sample in plan.samples]
+    return sorted(tasks_of_job), sorted(edges), [sample[:-1] for sample in plan.samples]
 
 
 def test_previews_are_spread_evenly_from_the_first_slot_on() -> None:
@@ -133,15 +135,19 @@ def test_a_plan_in_pieces_is_the_plan_made_at_once(
     context: Context, worker: PretendWorker, name: str, planner: Planner
 ) -> None:
     job_id = submit(context, GRIDS[name])
-    shown = show_job(context, job_id)
-    assert (shown.state, shown.progress.planned, shown.progress.total) == (JobState.planning, 0, 0)
-    seen = []
+    detail = show_job(context, job_id)
+    assert (detail.state, detail.progress.planned, detail.progress.total) == (
+        JobState.planning,
+        0,
+        0,
+    )
+    counts = []
     while planner.step():
         check(context)
-        seen.append(show_job(context, job_id).progress.planned)
-    assert seen[-1] == shown.sample_count
-    assert len(seen) > 1
-    assert seen == sorted(set(seen))
+        counts.append(show_job(context, job_id).progress.planned)
+    assert counts[-1] == detail.sample_count
+    assert len(counts) > 1
+    assert counts == sorted(set(counts))
     assert show_job(context, job_id).state is JobState.queued
     assert written(context, job_id) == planned(GRIDS[name])
 
@@ -149,8 +155,12 @@ def test_a_plan_in_pieces_is_the_plan_made_at_once(
 def test_a_small_job_is_planned_while_the_request_waits(
     context: Context, worker: PretendWorker, planner: Planner
 ) -> None:
-    shown = show_job(context, submit(context, rods()))
-    assert (shown.state, shown.progress.planned, shown.progress.total) == (JobState.queued, 4, 11)
+    detail = show_job(context, submit(context, rods()))
+    assert (detail.state, detail.progress.planned, detail.progress.total) == (
+        JobState.queued,
+        4,
+        11,
+    )
     assert not planner.step()
 
 
@@ -162,21 +172,25 @@ def test_what_is_planned_runs_meanwhile_and_so_do_other_jobs(
     planner.step()
     assert worker.work() == (4 + 4 + 2) + (2 + 2 + 1 + 1)
     assert show_job(context, other).state is JobState.succeeded
-    shown = show_job(context, job_id)
-    assert (shown.state, shown.progress.done, shown.progress.total, shown.progress.planned) == (
+    detail = show_job(context, job_id)
+    assert (detail.state, detail.progress.done, detail.progress.total, detail.progress.planned) == (
         JobState.planning,
         10,
         10,
         4,
     )
-    assert shown.started_at is not None
-    assert shown.progress.eta is None
+    assert detail.started_at is not None
+    assert detail.progress.eta is None
     planner.run()
     check(context)
     worker.work()
-    shown = show_job(context, job_id)
-    assert (shown.state, shown.progress.done, shown.progress.total) == (JobState.succeeded, 39, 39)
-    assert shown.progress.stages[Stage.simulate].cached == 0
+    detail = show_job(context, job_id)
+    assert (detail.state, detail.progress.done, detail.progress.total) == (
+        JobState.succeeded,
+        39,
+        39,
+    )
+    assert detail.progress.stages[Stage.simulate].cached == 0
     check(context)
 
 
@@ -190,12 +204,12 @@ def test_a_large_job_that_was_made_before_runs_nothing(
     planner.run()
     assert worker.lease() == ()
     check_existing_datasets(context)
-    shown = show_job(context, again)
-    assert shown.state is JobState.succeeded
-    assert shown.dataset == show_job(context, first).dataset
+    detail = show_job(context, again)
+    assert detail.state is JobState.succeeded
+    assert detail.dataset == show_job(context, first).dataset
     assert {
         stage: (counted.cached, sum(counted.counts.values()))
-        for stage, counted in shown.progress.stages.items()
+        for stage, counted in detail.progress.stages.items()
     } == {
         Stage.simulate: (15, 15),
         Stage.render: (15, 15),
@@ -216,9 +230,9 @@ def test_rejections_of_earlier_pieces_reach_later_ones(
     planner.run()
     check(context)
     worker.work()
-    shown = show_job(context, job_id)
-    assert (shown.state, shown.rejected_count) == (JobState.failed, 12)
-    assert shown.reason is Reason.no_valid_samples
+    detail = show_job(context, job_id)
+    assert (detail.state, detail.rejected_count) == (JobState.failed, 12)
+    assert detail.reason is Reason.no_valid_samples
 
 
 def test_it_is_cancelled_half_planned_and_finished_by_another_job(
@@ -229,8 +243,8 @@ def test_it_is_cancelled_half_planned_and_finished_by_another_job(
     cancel_job(context, job_id)
     check(context)
     assert not planner.step()
-    shown = show_job(context, job_id)
-    assert (shown.state, shown.progress.planned) == (JobState.cancelled, 4)
+    detail = show_job(context, job_id)
+    assert (detail.state, detail.progress.planned) == (JobState.cancelled, 4)
     assert worker.lease() == ()
     again = submit(context)
     planner.run()
@@ -274,8 +288,8 @@ def test_quarantined_tasks_do_not_end_a_job_that_is_being_planned(
     job_id = submit(context)
     planner.step()
     for _ in range(context.settings.max_tries):
-        (bad, *others) = worker.lease(simulate=1)
-        assert not others
+        (bad, *further) = worker.lease(simulate=1)
+        assert not further
         worker.report((bad, failure(Reason.renderer_crash)))
         context.clock.advance(10)  # type: ignore[attr-defined]
         sweep(context)
@@ -284,8 +298,8 @@ def test_quarantined_tasks_do_not_end_a_job_that_is_being_planned(
     planner.run()
     worker.work()
     sweep(context)
-    shown = show_job(context, job_id)
-    assert (shown.state, shown.reason) == (JobState.failed, Reason.quarantined)
+    detail = show_job(context, job_id)
+    assert (detail.state, detail.reason) == (JobState.failed, Reason.quarantined)
     check(context)
 
 
@@ -303,9 +317,9 @@ def test_a_plan_that_cannot_be_made_fails_the_job_and_says_why(
     with context.database.write() as connection:
         release_claims(connection)
     assert planner.step()
-    shown = show_job(context, job_id)
-    assert (shown.state, shown.reason) == (JobState.failed, Reason.internal_error)
-    assert shown.message == "planning it failed after 4 of 15 samples: the axis bends"
+    detail = show_job(context, job_id)
+    assert (detail.state, detail.reason) == (JobState.failed, Reason.internal_error)
+    assert detail.message == "planning it failed after 4 of 15 samples: the axis bends"
     assert worker.lease() == ()
     check(context)
 
@@ -329,12 +343,12 @@ def test_jobs_wait_for_the_first_worker_and_are_planned_then(
     context: Context, planner: Planner
 ) -> None:
     job_id = submit(context)
-    shown = show_job(context, job_id)
-    assert (shown.state, shown.reason) == (JobState.queued, Reason.waiting_for_worker)
+    detail = show_job(context, job_id)
+    assert (detail.state, detail.reason) == (JobState.queued, Reason.waiting_for_worker)
     assert not planner.step()
     PretendWorker(DirectApi(context), context.store).register()
-    shown = show_job(context, job_id)
-    assert (shown.state, shown.reason, shown.message) == (JobState.planning, None, "")
+    detail = show_job(context, job_id)
+    assert (detail.state, detail.reason, detail.message) == (JobState.planning, None, "")
     planner.run()
     assert written(context, job_id) == planned(GRID)
     check(context)
@@ -362,18 +376,18 @@ def test_a_coordinator_that_is_killed_while_it_plans_goes_on_after_its_start(
     }
     document = {"kind": "rod_hang", "axes": axes}
     data = tmp_path / "data"
-    seen, job_id = [0], ""
+    counts, job_id = [0], ""
     for _ in range(4):
         server = start_server(data)
         with httpx.Client(base_url=server.url, trust_env=False) as client:
             if not job_id:
                 server.worker()
                 job_id = client.post("/v1/jobs", json=document).raise_for_status().json()["id"]
-            wait_until(lambda: _planned(client, job_id) > seen[-1])  # noqa: B023  # it is over when the block is
-            seen.append(_planned(client, job_id))
+            wait_until(lambda: _planned(client, job_id) > counts[-1])  # noqa: B023  # it is over when the block is
+            counts.append(_planned(client, job_id))
         server.process.kill()
         server.stop()
-        assert seen[-1] < 32_000, "it was planned before it could be killed"
+        assert counts[-1] < 32_000, "it was planned before it could be killed"
     context = Context.open(Settings.chosen(data=data))
     start(context)
     Planner(context).run()
@@ -393,10 +407,10 @@ def test_people_see_how_far_the_plan_is(
     monkeypatch.setattr(
         "stickslip_services.queue.background.PLAN_SECONDS", 1e6
     )  # it plans when the test calls it
-    made = make_app(settings, clock=clock)
-    context: Context = made.state.context
+    application = make_app(settings, clock=clock)
+    context: Context = application.state.context
     planner = Planner(context)
-    with serving(made) as url, httpx.Client(base_url=url, trust_env=False) as client:
+    with serving(application) as url, httpx.Client(base_url=url, trust_env=False) as client:
         worker = PretendWorker(DirectApi(context), context.store).register()
         answer = client.post("/v1/jobs", json=GRID)
         job = answer.raise_for_status().json()

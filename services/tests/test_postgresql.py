@@ -65,15 +65,15 @@ class Pair:
     servers: tuple[RunningServer, RunningServer]
     client: httpx.Client
 
-    def worker(self, which: int, name: str) -> PretendWorker:
-        server = self.servers[which]
+    def worker(self, index: int, name: str) -> PretendWorker:
+        server = self.servers[index]
         api = HttpApi(
             server.url, (server.data / "worker-key").read_text().strip(), self.client.post
         )
         return PretendWorker(api, DirectoryStore(self.settings.store_place), name=name).register()
 
-    def submit(self, which: int, **spec: object) -> str:
-        response = self.client.post(f"{self.servers[which].url}/v1/jobs", json=rods(**spec))
+    def submit(self, index: int, **spec: object) -> str:
+        response = self.client.post(f"{self.servers[index].url}/v1/jobs", json=rods(**spec))
         response.raise_for_status()
         return str(response.json()["id"])
 
@@ -109,8 +109,8 @@ def test_two_coordinators_share_the_work(pair: Pair) -> None:
     is_over = threading.Event()
     lost = Counter[str]()  # leases that expired before the report, as where the disk takes so long
 
-    def submit_all(which: int) -> None:
-        jobs.extend(pair.submit(which, **spec) for spec in specs)
+    def submit_all(index: int) -> None:
+        jobs.extend(pair.submit(index, **spec) for spec in specs)
 
     def work(worker: PretendWorker) -> None:
         while not is_over.wait(0.1):
@@ -131,7 +131,7 @@ def test_two_coordinators_share_the_work(pair: Pair) -> None:
             for job in pair.client.get(f"{pair.servers[0].url}/v1/jobs").json()["items"]
         }
 
-    threads = [threading.Thread(target=submit_all, args=(which,)) for which in range(2)]
+    threads = [threading.Thread(target=submit_all, args=(index,)) for index in range(2)]
     threads += [threading.Thread(target=work, args=(worker,)) for worker in workers]
     for thread in threads:
         thread.start()
@@ -147,8 +147,8 @@ def test_two_coordinators_share_the_work(pair: Pair) -> None:
         count = connection.scalar(select(func.count()).select_from(tasks))
         attempts = set(connection.scalars(select(tasks.c.attempts)))
     database.close()
-    ran = Counter(name for worker in workers for name in worker.finished_ids) - lost
-    assert (len(ran), set(ran.values()), attempts) == (count, {1}, {1})
+    finished = Counter(name for worker in workers for name in worker.finished_ids) - lost
+    assert (len(finished), set(finished.values()), attempts) == (count, {1}, {1})
     assert sum(bool(worker.finished_ids) for worker in workers) > 1
     for server in pair.servers:
         listed = pair.client.get(f"{server.url}/v1/jobs").json()["items"]
@@ -179,7 +179,7 @@ def test_requests_of_a_worker_may_go_to_any_coordinator(pair: Pair) -> None:
 
 
 def test_a_stream_hears_what_another_coordinator_does(pair: Pair) -> None:
-    one, other = (server.url for server in pair.servers)
+    first, other = (server.url for server in pair.servers)
     job = pair.submit(0, gamma=[21.0, 22.0])
     heard: list[tuple[str, float]] = []
     with (
@@ -195,7 +195,7 @@ def test_a_stream_hears_what_another_coordinator_does(pair: Pair) -> None:
                     2.5
                 )  # now the stream waits for the notifier: by itself it looks again after 15 s
                 asked = time.monotonic()
-                pair.client.post(f"{one}/v1/jobs/{job}:cancel").raise_for_status()
+                pair.client.post(f"{first}/v1/jobs/{job}:cancel").raise_for_status()
     assert [state for state, _ in heard][-1] == "cancelled"
     assert heard[-1][1] - asked < 6.0
 
@@ -324,19 +324,19 @@ def test_the_clock_is_that_of_the_database(settings: Settings) -> None:
     with first.write() as connection:
         now = float(connection.scalar(text("SELECT extract(epoch FROM clock_timestamp())")) or 0.0)
         assert first.clock() == pytest.approx(now, abs=0.2)
-        seen: list[float] = []
+        times: list[float] = []
 
         def wait_for_the_lock() -> None:
             with second.write():
-                seen.append(second.clock())
+                times.append(second.clock())
 
         thread = threading.Thread(target=wait_for_the_lock)
         thread.start()
         time.sleep(1.0)
-        assert not seen  # writers exclude each other across coordinators
+        assert not times  # writers exclude each other across coordinators
         left_at = first.clock()
     thread.join()
-    assert seen[0] > left_at - 0.01  # read after the wait, not before
+    assert times[0] > left_at - 0.01  # read after the wait, not before
     first.close()
     second.close()
 
@@ -453,8 +453,11 @@ def test_a_lost_database_is_built_again(settings: Settings, postgresql: "Postgre
     assert found_again.exit_code == 0, found_again.output
     again = Context.open(lost)
     start(again)
-    (found,) = list_datasets(again)
-    assert (found.id, found.versions[0].manifest) == (known[0].id, known[0].versions[0].manifest)
+    (dataset,) = list_datasets(again)
+    assert (dataset.id, dataset.versions[0].manifest) == (
+        known[0].id,
+        known[0].versions[0].manifest,
+    )
     again.close()
 
 
@@ -497,11 +500,11 @@ def test_databases_that_are_refused(postgresql: "PostgresqlServer", tmp_path: Pa
         newer.partition("?")[0].rpartition("/")[2],
     )
     assert "has the schema 9042, and this version of stickslip knows 0001" in refusal(newer)
-    others = postgresql.empty()
+    foreign = postgresql.empty()
     postgresql.execute(
-        "CREATE TABLE birds (name text)", others.partition("?")[0].rpartition("/")[2]
+        "CREATE TABLE birds (name text)", foreign.partition("?")[0].rpartition("/")[2]
     )
-    assert "is not a database of stickslip: give it one of its own" in refusal(others)
+    assert "is not a database of stickslip: give it one of its own" in refusal(foreign)
     postgresql.execute("CREATE DATABASE latin ENCODING latin1 LOCALE 'C' TEMPLATE template0")
     assert "must be UTF8, and is LATIN1" in refusal(postgresql.url("latin"))
     missing = refusal(postgresql.url("nowhere").replace("stickslip@", "stickslip:secret@"))
@@ -514,7 +517,7 @@ def test_databases_that_are_refused(postgresql: "PostgresqlServer", tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ("value", "shown"),
+    ("value", "censored"),
     [
         ("mysql://me:secret@host/x", "'mysql://me:***@host/x'"),
         ("postgresql+asyncpg://me:sec?ret@host/x", "'postgresql+asyncpg://me:***@host/x'"),
@@ -526,17 +529,17 @@ def test_databases_that_are_refused(postgresql: "PostgresqlServer", tmp_path: Pa
     ],
 )
 def test_other_databases_are_refused_without_their_password(
-    value: str, shown: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    value: str, censored: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rule = "database must be a URL of the form postgresql://USER@HOST/NAME, and is "
     with pytest.raises(SettingsError) as raised:
         Settings.chosen(data=tmp_path, database=value)
-    assert str(raised.value) == rule + shown
+    assert str(raised.value) == rule + censored
     assert main(["--data", str(tmp_path), "--database", value]) == 2
-    assert capsys.readouterr().err == f"error: {rule}{shown}\n"
+    assert capsys.readouterr().err == f"error: {rule}{censored}\n"
     result = CliRunner().invoke(app, ["up", "--data", str(tmp_path), "--database", value])
     assert result.exit_code != 0
-    assert rule + shown in result.stderr
+    assert rule + censored in result.stderr
 
 
 @pytest.mark.parametrize(

@@ -46,8 +46,10 @@ def test_no_prefix_can_hide_a_path_of_the_coordinator(tmp_path: Path) -> None:
 
 def addresses_of(page: str) -> set[str]:
     """Return the addresses that a page loads, follows or sends to, but for anchors."""
-    found = re.findall(r'(?:src|href|action|hx-get|hx-post|data-root|data-motion)="([^"#]+)', page)
-    return {address for address in found if not address.startswith("data:")}
+    matches = re.findall(
+        r'(?:src|href|action|hx-get|hx-post|data-root|data-motion)="([^"#]+)', page
+    )
+    return {address for address in matches if not address.startswith("data:")}
 
 
 @pytest.mark.parametrize("is_stripped", [True, False])
@@ -137,8 +139,8 @@ def test_the_service_works_behind_nginx(behind_nginx: tuple[str, RunningServer])
     fields = {"kind": "rod_hang", "axes.gamma.values": "3", "axes.phi0.values": "0"}
     headers = {"Origin": origin, "Content-Type": "application/x-www-form-urlencoded"}
     body = urlencode(fields | {"axes.phi1.values": "1, 2"})
-    made = httpx.post(f"{address}/ui/submit", content=body, headers=headers)
-    assert made.headers["hx-redirect"].startswith("/stickslip/jobs/job-")
+    response = httpx.post(f"{address}/ui/submit", content=body, headers=headers)
+    assert response.headers["hx-redirect"].startswith("/stickslip/jobs/job-")
     worker.work()
     # Downloads: a shard that the page of the dataset links to, and samples as a zip file.
     (dataset, *_) = httpx.get(f"{address}/v1/datasets").json()["items"]

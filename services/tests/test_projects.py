@@ -137,14 +137,14 @@ def test_the_api_answers_429_and_names_the_rule(
     data = tmp_path / "data"
     settings = Settings.chosen(data=data, durable=False, require_keys=True)
     with serving(make_app(settings)) as url:
-        made = CliRunner().invoke(
+        result = CliRunner().invoke(
             app,
             ["keys", "create", "ann", "--scope", "submit", "--project", "lab", "--data", str(data)],
         )
-        assert made.exit_code == 0, made.output
+        assert result.exit_code == 0, result.output
         done = CliRunner().invoke(app, ["projects", "quota", "lab", *option, "--data", str(data)])
         assert done.exit_code == 0, done.output
-        headers = {"Authorization": f"Bearer {made.stdout.strip()}"}
+        headers = {"Authorization": f"Bearer {result.stdout.strip()}"}
         with httpx.Client(base_url=url, headers=headers, trust_env=False) as client:
             first = client.post("/v1/jobs", json=rods())
             assert (first.status_code, first.json()["project"]) == (202, "lab")
@@ -152,17 +152,17 @@ def test_the_api_answers_429_and_names_the_rule(
             problem = refused.json()
             assert (refused.status_code, problem["code"]) == (429, "quota_exceeded")
             (field,) = problem["errors"]
-            what = option[0][2:]
+            rule = option[0][2:]
             assert (
                 field["rule"]
-                == f"{what} of the project 'lab' that have not ended must be at most {option[1]}"
+                == f"{rule} of the project 'lab' that have not ended must be at most {option[1]}"
             )
-            assert field["value"] == {"samples": "8", "jobs": "2"}[what]
+            assert field["value"] == {"samples": "8", "jobs": "2"}[rule]
             assert len(client.get("/v1/jobs").json()["items"]) == 1
             client.post(f"/v1/jobs/{first.json()['id']}:cancel")
             assert client.post("/v1/jobs", json=rods(gamma=(8.0, 9.0))).status_code == 202
-        shown = CliRunner().invoke(app, ["projects", "list", "--data", str(data)])
-        assert "lab" in shown.stdout, shown.output
+        result = CliRunner().invoke(app, ["projects", "list", "--data", str(data)])
+        assert "lab" in result.stdout, result.output
 
 
 def test_a_project_needs_a_name_that_can_be_typed(tmp_path: Path, context: Context) -> None:

@@ -365,12 +365,12 @@ def test_swapped_shards_are_found(origin: tuple[str, str], tmp_path: Path) -> No
     pairs = [group for group in sizes.values() if len(group) > 1]
     assert pairs
     for _ in range(200):
-        one, other = rng.sample(rng.choice(pairs), 2)
-        contents = one.read_bytes(), other.read_bytes()
-        other.write_bytes(contents[0]), one.write_bytes(contents[1])
-        found = {fault.path for fault in verify(tmp_path)}
-        assert found == {path.relative_to(tmp_path).as_posix() for path in (one, other)}
-        one.write_bytes(contents[0]), other.write_bytes(contents[1])
+        first, other = rng.sample(rng.choice(pairs), 2)
+        contents = first.read_bytes(), other.read_bytes()
+        other.write_bytes(contents[0]), first.write_bytes(contents[1])
+        damaged = {fault.path for fault in verify(tmp_path)}
+        assert damaged == {path.relative_to(tmp_path).as_posix() for path in (first, other)}
+        first.write_bytes(contents[0]), other.write_bytes(contents[1])
 
 
 def test_keys_that_the_manifest_does_not_list_are_found(

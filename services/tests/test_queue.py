@@ -91,10 +91,10 @@ def test_a_job_runs_from_grid_to_dataset(context: Context, worker: PretendWorker
 
 def test_tasks_are_composed_of_what_they_build_on(context: Context, worker: PretendWorker) -> None:
     submit(context)
-    (simulate, *others) = worker.lease(simulate=100)
+    (simulate, *further) = worker.lease(simulate=100)
     worker.report(
         (simulate, rejection("no equilibrium")),
-        *((task, worker.result(task.task)) for task in others),
+        *((task, worker.result(task.task)) for task in further),
     )
     renders = worker.lease(render=100)
     assert len(renders) == 3
@@ -206,13 +206,13 @@ def test_the_same_grid_again_runs_nothing(context: Context, worker: PretendWorke
 def test_a_bigger_grid_runs_what_is_new(context: Context, worker: PretendWorker) -> None:
     submit(context)
     worker.work()
-    ran = len(worker.finished_ids)
+    count = len(worker.finished_ids)
     bigger = submit(context, gamma=(1.0, 2.0, 5.0))
     worker.work()
     job = show_job(context, bigger)
     assert job.state is JobState.succeeded
     assert (
-        len(worker.finished_ids) - ran == 2 + 2 + 1 + 1
+        len(worker.finished_ids) - count == 2 + 2 + 1 + 1
     )  # two shards are those of the smaller grid
     assert job.progress.stages[Stage.simulate].cached == 4
     assert job.progress.stages[Stage.simulate].cpu_seconds == 4.0
@@ -256,11 +256,11 @@ def test_a_stale_token_is_refused(
 
 def test_another_worker_cannot_report(context: Context, worker: PretendWorker) -> None:
     submit(context)
-    (mine,) = worker.lease(simulate=1)
+    (lease,) = worker.lease(simulate=1)
     thief = PretendWorker(DirectApi(context), context.store, name="thief").register()
-    assert thief.finish(mine) == ["stale"]
-    assert thief.beat(mine) == (mine.task_id,)
-    assert worker.finish(mine, mine) == ["accepted", "duplicate"]
+    assert thief.finish(lease) == ["stale"]
+    assert thief.beat(lease) == (lease.task_id,)
+    assert worker.finish(lease, lease) == ["accepted", "duplicate"]
     check(context)
 
 
@@ -268,12 +268,12 @@ def test_a_heartbeat_keeps_a_lease(
     context: Context, worker: PretendWorker, clock: ManualClock
 ) -> None:
     submit(context)
-    (mine,) = worker.lease(simulate=1)
+    (lease,) = worker.lease(simulate=1)
     for _ in range(5):
         clock.advance(20)
-        assert worker.start(mine) == ()
+        assert worker.start(lease) == ()
         sweep(context)
-    assert worker.finish(mine) == ["accepted"]
+    assert worker.finish(lease) == ["accepted"]
 
 
 def test_an_expired_lease_is_no_failed_try(
@@ -512,9 +512,9 @@ def test_a_kind_that_no_worker_makes_is_refused(context: Context, worker: Preten
 def test_a_waiting_job_of_such_a_kind_fails(context: Context) -> None:
     job = submit_job(context, parsed(CLOTH), None)
     PretendWorker(DirectApi(context), context.store).register()
-    shown = show_job(context, job.id)  # type: ignore[union-attr]
-    assert shown.state is JobState.failed
-    assert "no worker makes 'cloth_drag'" in shown.message
+    detail = show_job(context, job.id)  # type: ignore[union-attr]
+    assert detail.state is JobState.failed
+    assert "no worker makes 'cloth_drag'" in detail.message
 
 
 def test_one_simulation_serves_all_looks_and_those_that_come_later(context: Context) -> None:
@@ -548,8 +548,8 @@ def test_many_renders_share_one_simulation(context: Context) -> None:
     worker.report((simulation, rejection()))
     assert worker.lease(render=10) == ()
     worker.work()
-    shown = show_job(context, job.id)  # type: ignore[union-attr]
-    assert (shown.state, shown.rejected_count) == (JobState.failed, 2)
+    detail = show_job(context, job.id)  # type: ignore[union-attr]
+    assert (detail.state, detail.rejected_count) == (JobState.failed, 2)
     check(context)
 
 
@@ -667,13 +667,13 @@ def test_versions_of_two_builds_at_once_do_not_share_a_number(
     other = PretendWorker(DirectApi(context), context.store, name="other", builds=builds).register()
     submit(context)
     publishes = []
-    for one in (worker, other):
-        while not (publish := one.lease(publish=1)):
-            one.finish(*one.lease())
-        publishes.append((one, publish[0]))
+    for publisher in (worker, other):
+        while not (publish := publisher.lease(publish=1)):
+            publisher.finish(*publisher.lease())
+        publishes.append((publisher, publish[0]))
     assert [lease.task.version for _, lease in publishes] == [1, 2]  # type: ignore[union-attr]
-    for one, lease in reversed(publishes):
-        assert one.finish(lease) == ["accepted"]
+    for publisher, lease in reversed(publishes):
+        assert publisher.finish(lease) == ["accepted"]
     check(context)
 
 
@@ -714,8 +714,8 @@ class TestPausing:
         assert counts(context, job, Stage.simulate) == {TaskState.pending: 3, TaskState.running: 1}
         assert worker.finish(running) == ["accepted"]
         sweep(context)
-        shown = show_job(context, job)
-        assert (shown.state, shown.progress.eta) == (JobState.paused, None)
+        detail = show_job(context, job)
+        assert (detail.state, detail.progress.eta) == (JobState.paused, None)
         assert worker.lease() == ()
         check(context)
         assert resume_job(context, job).state is JobState.running
@@ -813,9 +813,9 @@ def test_cancelling_a_job_writes_none_of_its_tasks(context: Context, worker: Pre
         assert connection.execute(select(tasks).order_by(tasks.c.seq)).all() == before
     assert worker.beat(*leases) == (leases[0].task_id,)
     sweep(context)
-    shown = show_job(context, job)
-    assert shown.state is JobState.cancelled
-    assert shown.progress.stages[Stage.simulate].counts == {TaskState.cancelled: 6}
+    detail = show_job(context, job)
+    assert detail.state is JobState.cancelled
+    assert detail.progress.stages[Stage.simulate].counts == {TaskState.cancelled: 6}
     check(context)
     worker.work()
     assert show_job(context, other).state is JobState.succeeded

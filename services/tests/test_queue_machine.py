@@ -90,7 +90,7 @@ class QueueMachine(RuleBasedStateMachine):
         self.cleaner = QueueCleaner(self.context, piece=CLEANED_ROWS)
         self.workers: dict[str, PretendWorker] = {}
         self.holders: dict[str, tuple[str, int, float]] = {}  # task -> worker id, token, expiry
-        self.seen: dict[str, float] = {}  # worker id -> when it beat or reported last
+        self.last_seen: dict[str, float] = {}  # worker id -> when it beat or reported last
         self.tokens: dict[str, int] = {}
         self.settled: set[str] = set()
         self.manifests: dict[tuple[str, int], str] = {}
@@ -100,9 +100,9 @@ class QueueMachine(RuleBasedStateMachine):
     # --- what happens
     # --------------------------------------------------------------------------------------------
 
-    @rule(target=submitted, which=st.integers(0, len(SPECS) - 1))
-    def submit(self, which: int) -> str:
-        job = submit_job(self.context, parsed(SPECS[which]), None)
+    @rule(target=submitted, number=st.integers(0, len(SPECS) - 1))
+    def submit(self, number: int) -> str:
+        job = submit_job(self.context, parsed(SPECS[number]), None)
         return job.id  # type: ignore[union-attr]
 
     @rule()
@@ -127,7 +127,7 @@ class QueueMachine(RuleBasedStateMachine):
         if old is not None:
             self.holders = {task: held for task, held in self.holders.items() if held[0] != old.id}
         self.workers[name] = worker
-        self.seen[worker.id] = self.clock()
+        self.last_seen[worker.id] = self.clock()
 
     @rule(
         target=leases,
@@ -159,7 +159,7 @@ class QueueMachine(RuleBasedStateMachine):
     def heartbeat(self, held: Held, started: bool) -> None:
         worker, lease = held
         dropped = worker.beat(lease, started=started)
-        self.seen[worker.id] = now = self.clock()
+        self.last_seen[worker.id] = now = self.clock()
         # A lease that has had its duration, and that its worker does not list, was lost on the way.
         self.holders = {
             task: held
@@ -181,7 +181,7 @@ class QueueMachine(RuleBasedStateMachine):
     @rule(target=reported, held=consumes(leases), how=st.sampled_from(HOW))
     def report(self, held: Held, how: str) -> Held:
         worker, lease = held
-        mine = self._holds(worker, lease)
+        is_held = self._holds(worker, lease)
         bad = {
             "crashed": failure(),
             "broken": failure(Reason.internal_error),
@@ -190,9 +190,9 @@ class QueueMachine(RuleBasedStateMachine):
         }
         result = worker.result(lease.task) if how == "well" else bad[how]
         verdict = worker.report((lease, result))
-        self.seen[worker.id] = self.clock()
-        assert verdict == (["accepted"] if mine else ["stale"])
-        if mine:
+        self.last_seen[worker.id] = self.clock()
+        assert verdict == (["accepted"] if is_held else ["stale"])
+        if is_held:
             del self.holders[lease.task_id]
             if how == "well":
                 self.settled.add(lease.task_id)
@@ -203,35 +203,35 @@ class QueueMachine(RuleBasedStateMachine):
         worker, lease = held
         before = dict(self.holders)
         assert worker.report((lease, failure())) in (["duplicate"], ["stale"])
-        self.seen[worker.id] = self.clock()
+        self.last_seen[worker.id] = self.clock()
         assert self.holders == before
 
     @rule(job=submitted)
     def cancel(self, job: str) -> None:
         try:
-            shown = cancel_job(self.context, job)
+            detail = cancel_job(self.context, job)
         except ConflictError:
             assert self.ended[job] is not JobState.cancelled
         else:
-            assert shown.state in (JobState.cancelling, JobState.cancelled)
+            assert detail.state in (JobState.cancelling, JobState.cancelled)
 
     @rule(job=submitted)
     def pause(self, job: str) -> None:
         try:
-            shown = pause_job(self.context, job)
+            detail = pause_job(self.context, job)
         except ConflictError:
             assert job in self.ended or show_job(self.context, job).state is JobState.cancelling
         else:
-            assert shown.state in (JobState.pausing, JobState.paused)
+            assert detail.state in (JobState.pausing, JobState.paused)
 
     @rule(job=submitted)
     def resume(self, job: str) -> None:
         try:
-            shown = resume_job(self.context, job)
+            detail = resume_job(self.context, job)
         except ConflictError:
             assert job in self.ended or show_job(self.context, job).state is JobState.cancelling
         else:
-            assert shown.state in (JobState.planning, JobState.queued, JobState.running)
+            assert detail.state in (JobState.planning, JobState.queued, JobState.running)
 
     @rule(job=submitted, priority=st.integers(-2, 2))
     def prioritise(self, job: str, priority: int) -> None:
@@ -357,7 +357,7 @@ class QueueMachine(RuleBasedStateMachine):
         self.holders = {
             task: held
             for task, held in self.holders.items()
-            if held[2] > now or self.seen[held[0]] > now - seconds
+            if held[2] > now or self.last_seen[held[0]] > now - seconds
         }
 
 

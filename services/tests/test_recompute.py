@@ -64,11 +64,11 @@ def finish(context: Context, worker: PretendWorker, clock: ManualClock, job: str
         worker.work()
         clock.advance(10)
         sweep(context)
-    shown = show_job(context, job)
-    assert shown.state is JobState.succeeded, shown.message
-    assert shown.dataset is not None
+    detail = show_job(context, job)
+    assert detail.state is JobState.succeeded, detail.message
+    assert detail.dataset is not None
     assert (
-        verify(directory(worker).dataset_path(shown.dataset.dataset, shown.dataset.version)) == []
+        verify(directory(worker).dataset_path(detail.dataset.dataset, detail.dataset.version)) == []
     )
     check(context)
 
@@ -116,8 +116,8 @@ def test_a_rotten_trajectory_is_simulated_again(
     """
     job = submit(context)
     worker.finish(*worker.lease(simulate=10))
-    (render, *others) = worker.lease(render=10)
-    worker.finish(*others)
+    (render, *further) = worker.lease(render=10)
+    worker.finish(*further)
     directory(worker).path(render.task.record.digest).unlink()  # type: ignore[union-attr]
     assert worker.finish(render) == ["accepted"]
     counts = show_job(context, job).progress.stages
@@ -172,8 +172,8 @@ def test_big_datasets_are_checked_by_the_coordinator_itself(
     with context.database.write() as connection:
         connection.execute(update(dataset_versions).values(bytes=SMALL_DATASET + 1))
     job = submit(context)
-    shown = show_job(context, job)
-    assert (shown.state, shown.message) == (
+    detail = show_job(context, job)
+    assert (detail.state, detail.message) == (
         JobState.queued,
         "the dataset exists already: its files are being checked",
     )

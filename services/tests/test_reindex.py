@@ -29,7 +29,7 @@ from stickslip_testing.worker import DirectApi, PretendWorker, rejection
 
 
 @pytest.fixture
-def made(settings: Settings) -> dict[str, object]:
+def datasets_before(settings: Settings) -> dict[str, object]:
     """Two datasets, one with a rejected sample; then the database is lost. Their listings."""
     context = Context.open(settings)
     start(context)
@@ -52,7 +52,7 @@ def run(settings: Settings) -> Result:
 
 
 def test_a_lost_database_is_not_taken_for_a_new_one(
-    settings: Settings, made: dict[str, object], capsys: pytest.CaptureFixture[str]
+    settings: Settings, datasets_before: dict[str, object], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["--data", str(settings.data), "--port", "0"]) == 2
     (sentence,) = capsys.readouterr().err.splitlines()
@@ -62,7 +62,10 @@ def test_a_lost_database_is_not_taken_for_a_new_one(
 
 
 def test_a_database_is_migrated_before_a_coordinator_starts(
-    settings: Settings, made: dict[str, object], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    settings: Settings,
+    datasets_before: dict[str, object],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert main(["--migrate", "--data", str(tmp_path / "new")]) == 0
     assert check(Settings(data=tmp_path / "new"), Role.coordinator)
@@ -74,7 +77,7 @@ def test_a_database_is_migrated_before_a_coordinator_starts(
 
 
 def test_datasets_are_found_again(
-    settings: Settings, made: dict[str, object], tmp_path: Path
+    settings: Settings, datasets_before: dict[str, object], tmp_path: Path
 ) -> None:
     result = run(settings)
     assert result.exit_code == 0, result.output
@@ -82,7 +85,7 @@ def test_datasets_are_found_again(
     again = run(settings)
     assert "0 versions found again, 2 known before, 0 left out" in again.stderr
     with served(settings.data) as server:
-        for dataset in made:
+        for dataset in datasets_before:
             pulled = CliRunner().invoke(
                 app, ["pull", dataset, str(tmp_path / dataset), "--url", server.url]
             )
@@ -90,15 +93,15 @@ def test_datasets_are_found_again(
             assert CliRunner().invoke(app, ["verify", str(tmp_path / dataset)]).exit_code == 0
     context = Context.open(settings)
     start(context)
-    found = {dataset.id: dataset for dataset in list_datasets(context)}
-    assert found.keys() == made.keys()
-    for dataset, before in made.items():
-        (old,), (new,) = before.versions, found[dataset].versions  # type: ignore[attr-defined]
+    indexed = {dataset.id: dataset for dataset in list_datasets(context)}
+    assert indexed.keys() == datasets_before.keys()
+    for dataset, before in datasets_before.items():
+        (old,), (new,) = before.versions, indexed[dataset].versions  # type: ignore[attr-defined]
         same = ("version", "manifest", "group", "sample_count", "valid_count", "bytes")
         assert [getattr(new, name) for name in same[:-1]] == [
             getattr(old, name) for name in same[:-1]
         ]
-        assert found[dataset].name == before.name  # type: ignore[attr-defined]
+        assert indexed[dataset].name == before.name  # type: ignore[attr-defined]
     assert {job.state for job in list_jobs(context)} == {
         JobState.succeeded,
         JobState.succeeded_with_rejects,
@@ -110,7 +113,7 @@ def test_datasets_are_found_again(
 
 
 def test_a_spec_that_is_submitted_again_finds_its_dataset(
-    settings: Settings, made: dict[str, object]
+    settings: Settings, datasets_before: dict[str, object]
 ) -> None:
     run(settings)
     context = Context.open(settings)
@@ -118,8 +121,8 @@ def test_a_spec_that_is_submitted_again_finds_its_dataset(
     worker = PretendWorker(DirectApi(context), context.store).register()
     job = submit_job(context, parsed(rods(name="first")), None)
     sweep(context)
-    shown = show_job(context, job.id)  # type: ignore[union-attr]
-    assert shown.state is JobState.succeeded
+    detail = show_job(context, job.id)  # type: ignore[union-attr]
+    assert detail.state is JobState.succeeded
     assert worker.work() == 0
     bigger = submit_job(context, parsed(rods(gamma=(1.0, 2.0, 3.0))), None)
     worker.work()
@@ -130,11 +133,11 @@ def test_a_spec_that_is_submitted_again_finds_its_dataset(
 
 
 def test_a_dataset_that_rots_afterwards_is_made_again(
-    settings: Settings, made: dict[str, object]
+    settings: Settings, datasets_before: dict[str, object]
 ) -> None:
     run(settings)
     store = DirectoryStore(settings.store_place)
-    (path,) = store.dataset_path(next(iter(made)), 1).glob("views/c/0/0")
+    (path,) = store.dataset_path(next(iter(datasets_before)), 1).glob("views/c/0/0")
     store.path(sha256(path.read_bytes())).unlink()
     path.write_bytes(b"rotten")
     context = Context.open(settings)
@@ -143,7 +146,11 @@ def test_a_dataset_that_rots_afterwards_is_made_again(
     worker.judge = lambda task: (
         rejection() if task.stage == "simulate" and task.simulation.gamma == 9.0 else None
     )
-    spec = rods(gamma=(9.0, 1.0)) if path.parts[-6] == next(iter(made)) else rods(name="first")
+    spec = (
+        rods(gamma=(9.0, 1.0))
+        if path.parts[-6] == next(iter(datasets_before))
+        else rods(name="first")
+    )
     job = submit_job(context, parsed(spec), None)
     sweep(context)
     assert worker.work() > 0
@@ -154,10 +161,10 @@ def test_a_dataset_that_rots_afterwards_is_made_again(
 
 @pytest.mark.parametrize("damage", ["manifest", "file", "moved"])
 def test_a_version_that_is_not_whole_is_left_out(
-    settings: Settings, made: dict[str, object], damage: str
+    settings: Settings, datasets_before: dict[str, object], damage: str
 ) -> None:
     store = DirectoryStore(settings.store_place)
-    place = store.dataset_path(next(iter(made)), 1)
+    place = store.dataset_path(next(iter(datasets_before)), 1)
     if damage == "manifest":
         (
             place / MANIFEST_NAME
@@ -175,10 +182,10 @@ def test_a_version_that_is_not_whole_is_left_out(
 
 
 def test_an_artifact_that_is_gone_is_put_back_from_the_version(
-    settings: Settings, made: dict[str, object]
+    settings: Settings, datasets_before: dict[str, object]
 ) -> None:
     store = DirectoryStore(settings.store_place)
-    path = store.dataset_path(next(iter(made)), 1) / "views/c/0/0"
+    path = store.dataset_path(next(iter(datasets_before)), 1) / "views/c/0/0"
     digest = sha256(path.read_bytes())
     store.path(digest).unlink()
     assert run(settings).exit_code == 0
@@ -186,7 +193,7 @@ def test_an_artifact_that_is_gone_is_put_back_from_the_version(
 
 
 def test_it_does_not_write_beside_a_running_coordinator(
-    settings: Settings, made: dict[str, object]
+    settings: Settings, datasets_before: dict[str, object]
 ) -> None:
     with locked(settings.data):
         result = run(settings)
@@ -194,7 +201,7 @@ def test_it_does_not_write_beside_a_running_coordinator(
     assert "is in use by another `stickslip up`" in result.stderr
     with opened(settings, Role.upkeep) as database:
         assert [
-            found.is_new for found in reindex(database, DirectoryStore(settings.store_place))
+            version.is_new for version in reindex(database, DirectoryStore(settings.store_place))
         ] == [True, True]
 
 
@@ -220,7 +227,10 @@ def test_a_newer_database_is_refused(
 
 @pytest.mark.parametrize("revision", ["0001", "0001_0123456789ab"])
 def test_the_directory_of_an_earlier_state_is_refused_and_not_touched(
-    settings: Settings, made: dict[str, object], capsys: pytest.CaptureFixture[str], revision: str
+    settings: Settings,
+    datasets_before: dict[str, object],
+    capsys: pytest.CaptureFixture[str],
+    revision: str,
 ) -> None:
     """0.1.0 was not released: its tables have changed without a migration."""
     with opened(settings, Role.upkeep) as database, database.write() as connection:

@@ -48,40 +48,40 @@ ON_CLOTH: dict[str, Any] = {
 def test_a_scene_shows_its_sheets_and_the_forces_between_its_things() -> None:
     data = sample(**ON_CLOTH)
     arrays = data.arrays
-    shown = sample_view(data, 0)
-    assert shown["paths"]
-    assert shown["has_contact"]
-    assert (shown["layers"], len(shown["frames"])) == (["video"], arrays["video"].shape[0])
-    assert shown["instants"] == arrays["cloth.positions"].shape[0]
+    view = sample_view(data, 0)
+    assert view["paths"]
+    assert view["has_contact"]
+    assert (view["layers"], len(view["frames"])) == (["video"], arrays["video"].shape[0])
+    assert view["instants"] == arrays["cloth.positions"].shape[0]
 
-    text = str(shown["plots"])
+    text = str(view["plots"])
     for name in ("cloth, floor", "cloth, stretched", "cloth.left", "stretched.frame"):
         assert name in text
-    assert all(plot["timed"] for plot in shown["plots"])
-    assert list(shown["groups"]) == ["Parameters", "Looks", "Physics", "Checks"]
-    assert next(iter(shown["groups"]["Parameters"])) == "fabric"
-    assert {"psnr_cloth", "light"} <= set(shown["groups"]["Looks"])
-    assert {"stretch", "valid"} <= set(shown["groups"]["Checks"])
+    assert all(plot["timed"] for plot in view["plots"])
+    assert list(view["groups"]) == ["Parameters", "Looks", "Physics", "Checks"]
+    assert next(iter(view["groups"]["Parameters"])) == "fabric"
+    assert {"psnr_cloth", "light"} <= set(view["groups"]["Looks"])
+    assert {"stretch", "valid"} <= set(view["groups"]["Checks"])
 
 
 def test_a_view_in_space_has_what_the_scene_has() -> None:
-    shown = motion(sample(**ON_CLOTH), 0)
-    assert [(sheet["name"], len(sheet["contact"][0])) for sheet in shown["sheets"]] == [
+    view = motion(sample(**ON_CLOTH), 0)
+    assert [(sheet["name"], len(sheet["contact"][0])) for sheet in view["sheets"]] == [
         ("cloth", 25),
         ("stretched", 25),
     ]
-    assert [body["type"] for body in shown["bodies"]] == ["plane"]
-    assert len(shown["holders"]) == 2  # and no rim
+    assert [body["type"] for body in view["bodies"]] == ["plane"]
+    assert len(view["holders"]) == 2  # and no rim
     assert (
-        len(shown["instants"])
-        == len(shown["sheets"][0]["points"])
-        == len(shown["bodies"][0]["poses"])
+        len(view["instants"])
+        == len(view["sheets"][0]["points"])
+        == len(view["bodies"][0]["poses"])
         == 300
     )
 
     edge: dict[str, Any] = {"scene": "over-the-edge", "set": {"sheets.strip.mesh.cells": [40, 4]}}
-    shown = motion(sample({"rounding": np.float64(0.02)}, kind="cloth_scene", **edge), 0)
-    table, floor = sorted(shown["bodies"], key=lambda body: str(body["type"]))
+    view = motion(sample({"rounding": np.float64(0.02)}, kind="cloth_scene", **edge), 0)
+    table, floor = sorted(view["bodies"], key=lambda body: str(body["type"]))
     assert (table["type"], table["rounding"], floor["type"]) == (
         "box",
         0.02,
@@ -92,13 +92,13 @@ def test_a_view_in_space_has_what_the_scene_has() -> None:
     track = np.zeros((300, 25, 3), np.float32)
     track[:, :, 2] = 0.12345
     rest = np.stack(np.meshgrid(range(5), range(5)), axis=-1).reshape(25, 2).astype(np.float32)
-    shown = motion(
+    view = motion(
         sample({"positions": track, "rest": rest}, kind="cloth_drag", mesh=5, axes=drag), 0
     )
-    assert [body["type"] for body in shown["bodies"]] == ["plane"]
-    assert "contact" not in shown["sheets"][0]
-    assert shown["sheets"][0]["points"][7][2] == pytest.approx(0.12345 / shown["unit"], abs=0.5)
-    assert [holder["poses"][0][11] for holder in shown["holders"]] == pytest.approx(
+    assert [body["type"] for body in view["bodies"]] == ["plane"]
+    assert "contact" not in view["sheets"][0]
+    assert view["sheets"][0]["points"][7][2] == pytest.approx(0.12345 / view["unit"], abs=0.5)
+    assert [holder["poses"][0][11] for holder in view["holders"]] == pytest.approx(
         [0.12345, 0.12345]
     )
 
@@ -155,9 +155,9 @@ def test_a_great_list_is_filtered_by_names_numbers_and_pictures() -> None:
     wrong = {"where0.label": "psnr_cloth", "where0.operator": ">=", "where0.value": "bright"}
     assert "must be compared with a number" in thumbs(data, wrong, 0)["fault"]
     assert chosen(**{"mu.from": "-1"}) == count
-    shown = thumbs(data, {"mu.from": "1", "mu.to": "99", **bright}, 0)
+    listed = thumbs(data, {"mu.from": "1", "mu.to": "99", **bright}, 0)
     lowest, highest = (sliders(data.manifest.spec)[1]["values"][stop] for stop in (1, 99))
-    assert shown["pull_options"] == (
+    assert listed["pull_options"] == (
         f"--where 'mu>={lowest}' --where 'mu<={highest}' --where 'psnr_cloth>=39.999'"
     )
     by_psnr = {"sort": "psnr_cloth", "order": "descending"}
@@ -166,18 +166,18 @@ def test_a_great_list_is_filtered_by_names_numbers_and_pictures() -> None:
     # Rejected samples come last.
     assert thumbs(data, {"sort": "psnr_cloth"}, 2976)["thumbs"][-1][0] == 0
     assert thumbs(data, {"sort": "nothing"}, 0)["thumbs"][0][0] == 0
-    shown = thumbs(data, {"texture.from": "1", "texture.to": "1"}, 48)
-    assert (len(shown["thumbs"]), shown["next_start"]) == (48, 96)
-    assert {point["texture"] for _, point, _ in shown["thumbs"]} == {sorted(axes["texture"])[1]}
+    listed = thumbs(data, {"texture.from": "1", "texture.to": "1"}, 48)
+    assert (len(listed["thumbs"]), listed["next_start"]) == (48, 96)
+    assert {point["texture"] for _, point, _ in listed["thumbs"]} == {sorted(axes["texture"])[1]}
 
 
 def test_a_long_motion_is_thinned() -> None:
     scene: dict[str, Any] = {"scene": "shawl", "set": {"duration": 9.0}}
-    shown = motion(sample(kind="cloth_scene", **scene), 0)
-    figure = shown["bodies"][0]
-    assert 20 <= len(shown["instants"]) < 136
-    assert shown["instants"][-1] == 135
-    assert len(figure["points"]) == len(shown["instants"])
+    view = motion(sample(kind="cloth_scene", **scene), 0)
+    figure = view["bodies"][0]
+    assert 20 <= len(view["instants"]) < 136
+    assert view["instants"][-1] == 135
+    assert len(figure["points"]) == len(view["instants"])
     assert len(figure["points"][0]) == 3 * 1442
 
 
@@ -207,17 +207,17 @@ def test_a_film_shows_the_frames_of_the_clip() -> None:
             10,
             "h264",
         )
-        shown = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
-        levels = [picture.mean() for picture in shown]
-    assert shown[0].shape == (224, 130, 3)
+        pictures = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
+        levels = [picture.mean() for picture in pictures]
+    assert pictures[0].shape == (224, 130, 3)
     assert levels == pytest.approx([20, 120, 220], abs=3)
 
 
 def test_ground_truth_is_shown_in_colours() -> None:
     y_x = {"frame": 2, "y": 1, "x": 2}
     flow = np.array([[[[0.0, 2.0], [-1.0, 0.0]]]] * 2, dtype=np.float16)
-    (shown,) = coloured(array("flow", "", "float16", y_x | {"xy": 2}), flow, [1])
-    assert shown.tolist() == [[[127, 255, 127], [63, 127, 127]]]
+    (picture,) = coloured(array("flow", "", "float16", y_x | {"xy": 2}), flow, [1])
+    assert picture.tolist() == [[[127, 255, 127], [63, 127, 127]]]
     depth = np.array([[[1.0, np.inf]], [[3.0, 2.0]]], dtype=np.float32)
     near, far = coloured(array("depth", "", "float32", y_x), depth, [0, 1])
     assert near.tolist() == [[[0, 0, 0], [0, 0, 0]]]

@@ -39,16 +39,16 @@ def small_sections(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def made(settings: Settings) -> FastAPI:
+def application(settings: Settings) -> FastAPI:
     """A coordinator; its worker rejects the sample in slot 5."""
     return make_app(settings)
 
 
 @pytest.fixture
-def origin(made: FastAPI) -> Iterator[tuple[str, str, PretendWorker]]:
+def origin(application: FastAPI) -> Iterator[tuple[str, str, PretendWorker]]:
     """URL, dataset and worker of a coordinator that has made a version with four sections."""
-    with serving(made) as url, Client(url) as client:
-        context: Context = made.state.context
+    with serving(application) as url, Client(url) as client:
+        context: Context = application.state.context
         worker = PretendWorker(DirectApi(context), context.store, whole=True).register()
         worker.judge = lambda task: (
             rejection()
@@ -58,12 +58,12 @@ def origin(made: FastAPI) -> Iterator[tuple[str, str, PretendWorker]]:
         )
         job = client.submit(rods(gamma=GAMMAS))
         worker.work()
-        shown = client.job(job.id)
-        assert (shown.state, shown.rejected_count) == (JobState.succeeded_with_rejects, 1), (
-            shown.message
+        detail = client.job(job.id)
+        assert (detail.state, detail.rejected_count) == (JobState.succeeded_with_rejects, 1), (
+            detail.message
         )
-        assert shown.dataset is not None
-        yield url, shown.dataset.dataset, worker
+        assert detail.dataset is not None
+        yield url, detail.dataset.dataset, worker
 
 
 def files(target: Path) -> set[str]:
@@ -153,17 +153,17 @@ def test_no_flipped_bit_of_a_section_or_the_manifest_is_silent(
 
 
 def test_a_section_that_is_damaged_in_the_store_is_made_again(
-    origin: tuple[str, str, PretendWorker], made: FastAPI
+    origin: tuple[str, str, PretendWorker], application: FastAPI
 ) -> None:
     url, dataset, worker = origin
-    context: Context = made.state.context
+    context: Context = application.state.context
     with Client(url) as client:
         entry = client.contents(dataset, 1).manifest.sections[2]
         context.store.path(entry.sha256).write_bytes(b"{}")  # type: ignore[attr-defined]
         job = client.submit(rods(gamma=GAMMAS))
         sweep(context)
-        shown = client.job(job.id)
-        assert "its manifest was damaged or lost" in shown.message
+        detail = client.job(job.id)
+        assert "its manifest was damaged or lost" in detail.message
         worker.finished_ids.clear()
         worker.work()
         assert client.job(job.id).state is JobState.succeeded_with_rejects
@@ -175,19 +175,19 @@ def test_a_section_that_is_damaged_in_the_store_is_made_again(
 
 def test_nothing_of_it_is_unused_and_it_is_found_again(
     origin: tuple[str, str, PretendWorker],
-    made: FastAPI,
+    application: FastAPI,
     settings: Settings,
     tmp_path: Path,
     clock: ManualClock,
 ) -> None:
     _, dataset, _ = origin
-    context: Context = made.state.context
+    context: Context = application.state.context
     (known,) = list_datasets(context)
-    shown = context.store.read(known.versions[0].manifest)
+    manifest = context.store.read(known.versions[0].manifest)
     needed = {
         file.sha256
         for file in Contents(
-            Manifest.model_validate_json(shown), lambda file: context.store.read(file.sha256)
+            Manifest.model_validate_json(manifest), lambda file: context.store.read(file.sha256)
         ).files()
     }
     free = {file.name for file in unused(context.database, context.store, older_than=-1)}
@@ -200,8 +200,8 @@ def test_nothing_of_it_is_unused_and_it_is_found_again(
     start(fresh)
     first = next(iter(needed - {known.versions[0].manifest}))
     context.store.delete(first)
-    (found,) = reindex(fresh.database, fresh.store)
-    assert (found.fault, found.samples) == ("", 8)
+    (indexed,) = reindex(fresh.database, fresh.store)
+    assert (indexed.fault, indexed.samples) == ("", 8)
     assert context.store.exists(first)  # from what the version shows
     assert [(each.id, each.versions[0].manifest) for each in list_datasets(fresh)] == [
         (dataset, known.versions[0].manifest)

@@ -60,11 +60,11 @@ def signers(tmp_path_factory: pytest.TempPathFactory) -> Signers:
             str(place / name),
         ]
         subprocess.run(command, check=True)
-    made = Signers(place / "lab", place / "stranger", place / "allowed")
-    made.allowed.write_text(
+    keys = Signers(place / "lab", place / "stranger", place / "allowed")
+    keys.allowed.write_text(
         f'lab@example.org namespaces="stickslip" {(place / "lab.pub").read_text()}'
     )
-    return made
+    return keys
 
 
 @dataclass
@@ -75,7 +75,7 @@ class Origin:
     dataset: str
     context: Context
 
-    def shown(self, name: str) -> Path:
+    def file_of_version(self, name: str) -> Path:
         return Path(self.context.store.place) / "datasets" / self.dataset / "v1" / name
 
 
@@ -89,9 +89,9 @@ def origin(tmp_path: Path, signers: Signers) -> Iterator[Origin]:
         worker = PretendWorker(DirectApi(context), context.store).register()
         job = client.submit(rods())
         worker.work()
-        made = client.job(job.id).dataset
-        assert made is not None
-        yield Origin(url, made.dataset, context)
+        detail = client.job(job.id).dataset
+        assert detail is not None
+        yield Origin(url, detail.dataset, context)
 
 
 def run(*words: object) -> tuple[int, str]:
@@ -105,8 +105,8 @@ def test_what_a_coordinator_signs_is_pulled_and_verified(
     target = tmp_path / "d"
     options = ("--allowed-signers", signers.allowed)
     assert run("pull", origin.dataset, target, *options, "--url", origin.url)[0] == 0
-    status, said = run("verify", target, *options)
-    assert (status, "signed by lab@example.org" in said) == (0, True), said
+    status, output = run("verify", target, *options)
+    assert (status, "signed by lab@example.org" in output) == (0, True), output
     with Client(origin.url) as client:
         served = client.request(
             "GET", f"/v1/datasets/{origin.dataset}/versions/1/files/manifest.sha256.sig"
@@ -132,7 +132,7 @@ def test_what_a_coordinator_signs_is_pulled_and_verified(
 def test_unsigned_unknown_and_changed_are_three_errors_and_nothing_is_written(
     origin: Origin, signers: Signers, tmp_path: Path
 ) -> None:
-    signature, target = origin.shown("manifest.sha256.sig"), tmp_path / "d"
+    signature, target = origin.file_of_version("manifest.sha256.sig"), tmp_path / "d"
     good = signature.read_bytes()
 
     def refused(error: type[ClientError], words: str) -> None:
@@ -143,7 +143,7 @@ def test_unsigned_unknown_and_changed_are_three_errors_and_nothing_is_written(
     signature.unlink()
     refused(UnsignedError, "is not signed")
     assert (
-        run("sign", origin.shown(""), "--key", signers.stranger)[0] == 0
+        run("sign", origin.file_of_version(""), "--key", signers.stranger)[0] == 0
     )  # served from the next request on
     refused(
         UnknownSignerError,
@@ -171,11 +171,11 @@ def test_a_dataset_that_is_changed_and_sealed_again_is_found(
     assert verify(target) == []  # it is consistent in itself
     with pytest.raises(ChangedError):
         signer_of(target, signers.allowed)
-    status, said = run("verify", target, "--allowed-signers", signers.allowed)
-    assert (status, "the dataset or its signature was changed" in said) == (1, True), said
+    status, output = run("verify", target, "--allowed-signers", signers.allowed)
+    assert (status, "the dataset or its signature was changed" in output) == (1, True), output
     (target / "zarr.json").write_bytes(b"{}")
-    status, said = run("sign", target, "--key", signers.lab)
-    assert (status, "is not signed, because it is damaged" in said) == (1, True), said
+    status, output = run("sign", target, "--key", signers.lab)
+    assert (status, "is not signed, because it is damaged" in output) == (1, True), output
 
 
 def test_a_signed_version_is_not_passed_off_as_another(
@@ -199,7 +199,7 @@ def test_a_signed_version_is_not_passed_off_as_another(
 def test_a_scrub_signs_again_what_has_no_good_signature(
     origin: Origin, signers: Signers, monkeypatch: pytest.MonkeyPatch, damage: str
 ) -> None:
-    signature = origin.shown("manifest.sha256.sig")
+    signature = origin.file_of_version("manifest.sha256.sig")
     good = signature.read_bytes()
     if damage == "lost":
         signature.unlink()
@@ -210,17 +210,17 @@ def test_a_scrub_signs_again_what_has_no_good_signature(
     elif damage == "of another version":
         signature.write_bytes(sign(b"another seal", signers.lab))
     elif damage == "by another key":
-        assert run("sign", origin.shown(""), "--key", signers.stranger)[0] == 0
+        assert run("sign", origin.file_of_version(""), "--key", signers.stranger)[0] == 0
     is_broken = damage not in ("none", "by another key")
     command = ("scrub", "--data", origin.context.settings.data)
     if is_broken:
         assert run(*command)[0] == 0  # without a key nobody knows that it should be signed
     monkeypatch.setenv("STICKSLIP_SIGNING_KEY", str(signers.lab))
-    status, said = run(*command)
-    assert (status, f"{origin.dataset}:v1  manifest.sha256.sig" in said) == (
+    status, output = run(*command)
+    assert (status, f"{origin.dataset}:v1  manifest.sha256.sig" in output) == (
         is_broken,
         is_broken,
-    ), said
+    ), output
     assert run(*command)[0] == 0
     assert (signature.read_bytes() == good) == (damage != "by another key")
     with origin.context.database.read() as connection:

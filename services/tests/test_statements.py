@@ -22,12 +22,14 @@ class Preview(NamedTuple):
     digest: str
 
 
-SOME = (
+CHOSEN = (
     select(previews)
     .where(previews.c.task.in_(bindparam("b_tasks", expanding=True)))
     .order_by(previews.c.task)
 )
-OTHERS = select(previews.c.task).where(previews.c.task.not_in(bindparam("b_tasks", expanding=True)))
+REMAINING = select(previews.c.task).where(
+    previews.c.task.not_in(bindparam("b_tasks", expanding=True))
+)
 FIXED = select(previews.c.task).where(previews.c.digest.in_(["d1", "d4", "nothing"]))
 
 pytestmark = pytest.mark.databases
@@ -46,10 +48,10 @@ def filled(empty_database: Callable[[], Database]) -> Database:
 
 def test_rows_have_the_names_of_their_columns(filled: Database) -> None:
     with filled.read() as connection:
-        rows = RowQuery(Preview, SOME).rows(connection, {"b_tasks": [3, 1]})
+        rows = RowQuery(Preview, CHOSEN).rows(connection, {"b_tasks": [3, 1]})
         assert rows == [Preview(1, "d1"), Preview(3, "d3")]
         assert [tuple(row) for row in rows] == [
-            tuple(row) for row in connection.execute(SOME, {"b_tasks": [3, 1]})
+            tuple(row) for row in connection.execute(CHOSEN, {"b_tasks": [3, 1]})
         ]
 
 
@@ -59,7 +61,7 @@ def test_a_row_type_with_other_fields_is_refused() -> None:
         task: int
 
     with pytest.raises(TypeError, match="Wrong has the fields"):
-        RowQuery(Wrong, SOME)
+        RowQuery(Wrong, CHOSEN)
 
 
 @pytest.mark.parametrize("size", [0, 1, 2, 3, 4, 5, 2000])
@@ -69,16 +71,16 @@ def test_a_list_may_have_any_size(filled: Database, size: int) -> None:
     expected = wanted[:5]
     with filled.read() as connection:
         for _ in range(2):  # the second time the SQL is known
-            rows = RowQuery(Preview, SOME).rows(connection, {"b_tasks": wanted})
+            rows = RowQuery(Preview, CHOSEN).rows(connection, {"b_tasks": wanted})
             assert [row.task for row in rows] == expected
-        others = ValueQuery[int](OTHERS).values(connection, {"b_tasks": wanted})
-        assert sorted(others) == [task for task in range(5) if task not in expected]
+        remaining = ValueQuery[int](REMAINING).values(connection, {"b_tasks": wanted})
+        assert sorted(remaining) == [task for task in range(5) if task not in expected]
 
 
 def test_lists_beyond_a_batch_are_read_in_batches(filled: Database) -> None:
     with filled.read() as connection:
         items = [*range(10, BATCH + 10), 2]
-        rows = RowQuery(Preview, SOME).batched_rows(connection, "b_tasks", items)
+        rows = RowQuery(Preview, CHOSEN).batched_rows(connection, "b_tasks", items)
         assert rows == [Preview(2, "d2")]
 
 

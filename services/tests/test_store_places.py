@@ -44,12 +44,12 @@ def test_a_place_that_is_no_store_is_refused(
     verb, *rest = command
     words = [*rest, "--data", "data", "--store", "s3:/lab/store"]
     if verb == "coordinator":
-        status, said = program.main(words), ""
+        status, output = program.main(words), ""
     else:
         result = CliRunner().invoke(app, [verb, *words], env={"COLUMNS": "200"})
-        status, said = result.exit_code, result.output
+        status, output = result.exit_code, result.output
     assert status != 0
-    assert re.search(REFUSAL, said + capfd.readouterr().err)
+    assert re.search(REFUSAL, output + capfd.readouterr().err)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -123,9 +123,9 @@ def test_a_bucket_is_a_store_like_any_other(
         assert np.array_equal(served[:], np.arange(4.0))
     host, _, prefix = bucket.removeprefix("s3://").partition("/")
     place = obstore.store.S3Store(host, prefix=f"{prefix}/datasets/{names[0]}/v1")
-    kept = zarr.open_group(zarr.storage.ObjectStore(place, read_only=True), mode="r")["mu"]
-    assert isinstance(kept, zarr.Array)
-    assert np.array_equal(kept[:], np.arange(4.0))
+    column = zarr.open_group(zarr.storage.ObjectStore(place, read_only=True), mode="r")["mu"]
+    assert isinstance(column, zarr.Array)
+    assert np.array_equal(column[:], np.arange(4.0))
 
     place_options = ["--data", str(in_bucket.data), "--store", bucket]
     assert stickslip("gc", "--delete", "--older-than", "0", *place_options).exit_code == 0
@@ -138,15 +138,15 @@ def test_a_bucket_is_a_store_like_any_other(
 
     in_bucket.database_path.unlink()
     assert program.main(["--port", "0", *place_options]) == 2
-    said = capfd.readouterr().err
-    assert f"{bucket} holds datasets, and the database" in said
-    assert "run `stickslip reindex" in said
+    output = capfd.readouterr().err
+    assert f"{bucket} holds datasets, and the database" in output
+    assert "run `stickslip reindex" in output
     assert f"{names[0]}:v1  4 samples" in stickslip("reindex", *place_options).output
     context = Context.open(in_bucket)
     start(context)
-    (found,) = list_datasets(context)
-    (version,) = found.versions
-    assert found.id == names[0]
+    (listed,) = list_datasets(context)
+    (version,) = listed.versions
+    assert listed.id == names[0]
     assert damaged_files(context.store, version.manifest, version.group) == {}
     context.close()
 
@@ -195,9 +195,9 @@ def test_jobs_wait_while_the_bucket_is_away(
     s3.fault = lambda method, path: "503"
     clock.advance(PROBE_SECONDS)
     sweep(context)
-    shown = show_job(context, job)
-    assert (shown.state, shown.reason) == (JobState.paused, Reason.store_unavailable)
-    assert in_bucket.store_place in shown.message
+    detail = show_job(context, job)
+    assert (detail.state, detail.reason) == (JobState.paused, Reason.store_unavailable)
+    assert in_bucket.store_place in detail.message
     assert worker.lease() == ()
 
     s3.fault = no_fault

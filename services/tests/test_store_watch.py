@@ -78,8 +78,8 @@ def test_a_full_disk_pauses_within_ten_seconds_and_room_lets_go_on(
         begin = time.monotonic()
         wait_until(lambda: job_of(server, job)["reason"] == "store_unavailable", seconds=10)
         assert time.monotonic() - begin < 10
-        shown = job_of(server, job)
-        assert "must stay free" in str(shown["message"])
+        detail = job_of(server, job)
+        assert "must stay free" in str(detail["message"])
         if left:
             wait_until(lambda: job_of(server, job)["state"] == "paused", seconds=5)
             assert worker.lease() == ()
@@ -109,9 +109,9 @@ def test_a_read_only_store_pauses_the_job(disk: Path, tmp_path: Path) -> None:
     worker.report((lease, failure(Reason.store_unavailable, str(raised.value))))
     assert worker.lease() == ()
     sweep(context)
-    shown = show_job(context, job)
-    assert shown.reason is Reason.store_unavailable
-    assert "Read-only file system" in shown.message
+    detail = show_job(context, job)
+    assert detail.reason is Reason.store_unavailable
+    assert "Read-only file system" in detail.message
     subprocess.run(["mount", "-o", "remount,rw", disk], check=True)
     context.clock.advance(HOLD_SECONDS + 1)  # type: ignore[attr-defined]
     sweep(context)
@@ -128,9 +128,9 @@ def test_a_store_that_is_a_file_pauses_the_job(context: Context, worker: Pretend
     root.write_text("in the way")
     job = submit_job(context, parsed(rods()), None).id  # type: ignore[union-attr]
     sweep(context)
-    shown = show_job(context, job)
-    assert (shown.state, shown.reason) == (JobState.paused, Reason.store_unavailable)
-    assert "File exists" in shown.message
+    detail = show_job(context, job)
+    assert (detail.state, detail.reason) == (JobState.paused, Reason.store_unavailable)
+    assert "File exists" in detail.message
     root.unlink()
     sweep(context)
     assert show_job(context, job).state is JobState.queued
@@ -163,9 +163,9 @@ def test_a_store_that_only_a_worker_cannot_use_costs_no_try(
         worker.report((lease, failure(Reason.store_unavailable, "Permission denied")))
         assert worker.lease() == ()
         sweep(context)
-        shown = show_job(context, job)
-        assert (shown.state, shown.reason) == (JobState.paused, Reason.store_unavailable)
-        assert "worker pretend cannot use the store: Permission denied" in shown.message
+        detail = show_job(context, job)
+        assert (detail.state, detail.reason) == (JobState.paused, Reason.store_unavailable)
+        assert "worker pretend cannot use the store: Permission denied" in detail.message
         with pytest.raises(ConflictError, match="goes on by itself"):
             resume_job(context, job)
         clock.advance(HOLD_SECONDS + 1)

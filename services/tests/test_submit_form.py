@@ -148,8 +148,8 @@ def test_a_form_that_a_job_filled_in_gives_its_spec_again(document: dict[str, An
     form, filling = filled_form(spec)
     again = job_spec_adapter.validate_python(document_of(form, filling.fields))
     assert again.model_dump(mode="json") == spec.model_dump(mode="json")
-    shown = job_spec_adapter.validate_python(yaml.safe_load(spec_text(spec)))
-    assert shown.content_digest == spec.content_digest
+    parsed_again = job_spec_adapter.validate_python(yaml.safe_load(spec_text(spec)))
+    assert parsed_again.content_digest == spec.content_digest
 
     changed = document_of(form, {**filling.fields, "seed": ["77"]})
     expected = spec.model_dump(mode="json") | {"seed": 77}
@@ -191,9 +191,9 @@ def test_a_form_is_checked_and_submitted(server: RunningServer) -> None:
     checked = post(server, "/ui/submit/check", filled).text
     assert "<dt>samples</dt><dd>10</dd>" in checked
     assert re.search(r"<dt>CPU time</dt><dd>about [\d.]+ (s|min)", checked)
-    shown = re.search(r">spec.yaml</p>.*?<pre[^>]*>(.*?)</pre>", checked, re.DOTALL)
-    assert shown is not None
-    assert yaml.safe_load(html.unescape(shown[1]))["axes"]["mu"]["num"] == 10
+    match = re.search(r">spec.yaml</p>.*?<pre[^>]*>(.*?)</pre>", checked, re.DOTALL)
+    assert match is not None
+    assert yaml.safe_load(html.unescape(match[1]))["axes"]["mu"]["num"] == 10
     assert f"curl {server.url}/v1/jobs" in html.unescape(checked)
     assert f'with Client("{server.url}") as client' in html.unescape(checked)
 

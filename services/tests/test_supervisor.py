@@ -148,16 +148,16 @@ def test_children_do_not_outlive_the_supervisor(up: Up) -> None:
     def pids() -> list[int]:
         return [up.dispatchers()[-1], up.started("head")[-1], up.coordinator()]
 
-    before, ours = len(up.dispatchers()), pids()
-    assert all(is_running(pid) for pid in ours)
+    before, children = len(up.dispatchers()), pids()
+    assert all(is_running(pid) for pid in children)
     up.process.kill()
-    wait_until(lambda: not any(is_running(pid) for pid in ours))
+    wait_until(lambda: not any(is_running(pid) for pid in children))
     again = Up(up.data.parent)
     wait_until(lambda: again.answers() and len(again.dispatchers()) > before, seconds=250)
-    ours = pids()
+    children = pids()
     output = again.stop(signal.SIGINT)
     assert again.process.returncode == 0, output
-    assert not any(is_running(pid) for pid in ours)
+    assert not any(is_running(pid) for pid in children)
     assert not (up.data / "url").exists()
 
 

@@ -166,14 +166,14 @@ def serving_tenants(folder: Path) -> Iterator[Tenants]:
         }
         alpha = clients["alpha"]
         worker = PretendWorker(DirectApi(context), context.store, whole=True).register()
-        made = alpha.post(
+        response = alpha.post(
             "/v1/jobs", json=rods(name="alpha-s"), headers={"Idempotency-Key": "one"}
         ).json()
         worker.work()
         upload = alpha.post(
             "/v1/textures", content=picture(7), headers={"Content-Type": "image/png"}
         ).json()
-        job = alpha.get(f"/v1/jobs/{made['id']}").json()
+        job = alpha.get(f"/v1/jobs/{response['id']}").json()
         assert job["state"] == "succeeded", job
         with context.database.read() as connection:
             stage, key = connection.execute(select(tasks.c.stage, tasks.c.key).limit(1)).one()
@@ -237,10 +237,12 @@ def test_what_belongs_to_another_project_is_not_found(
         assert refused.status_code == 405
         return
     assert refused.status_code == 404, refused.text
-    own = tenants.call(tenants.alpha, method, path)
-    assert own.status_code != 404 or "array" in path, own.text  # rods have no pictures of that name
+    allowed = tenants.call(tenants.alpha, method, path)
+    assert allowed.status_code != 404 or "array" in path, (
+        allowed.text
+    )  # rods have no pictures of that name
     assert (
-        refused.text.replace(refused.headers["x-request-id"], "") not in own.text
+        refused.text.replace(refused.headers["x-request-id"], "") not in allowed.text
         or method == "HEAD"
     )
 
@@ -293,11 +295,11 @@ def test_no_answer_that_needs_a_key_is_kept_by_a_shared_cache(
         ]
         for method, template in calls:
             answer = tenants.call(client, method, template)
-            shown = f"{method} {template}: {answer.status_code} {answer.headers}"
-            assert not may_be_kept_by_a_shared_cache(answer), shown
-            assert "authorization" in answer.headers.get("vary", "").lower(), shown
+            summary = f"{method} {template}: {answer.status_code} {answer.headers}"
+            assert not may_be_kept_by_a_shared_cache(answer), summary
+            assert "authorization" in answer.headers.get("vary", "").lower(), summary
             if reader in ("nobody", "wrong key") and template not in open_to_all:
-                assert answer.status_code == 401, shown
+                assert answer.status_code == 401, summary
 
 
 def counting_app() -> FastAPI:
@@ -361,16 +363,16 @@ def read_through_a_cache(tenants: Tenants, folder: Path) -> None:
                     if authorization is not None:
                         client.headers["Authorization"] = authorization
                     answer = tenants.call(client, "GET", template)
-                    shown = f"{reader}: {template}: {answer.status_code} {answer.headers}"
-                    assert answer.headers["X-Cache"] != "HIT", shown
+                    summary = f"{reader}: {template}: {answer.status_code} {answer.headers}"
+                    assert answer.headers["X-Cache"] != "HIT", summary
                     if ("GET", template) in OWNED:
                         expected = {404} if reader == "another project" else {401}
-                        assert answer.status_code in expected, shown
+                        assert answer.status_code in expected, summary
                     elif reader != "another project" and template not in ("/livez", "/readyz"):
-                        assert answer.status_code == 401, shown
+                        assert answer.status_code == 401, summary
                     assert tenants.parameters["job_id"] not in answer.text or (
                         tenants.parameters["job_id"] in str(answer.url)
-                    ), shown
+                    ), summary
 
 
 def test_a_file_is_private_in_every_form_of_its_answer(tenants: Tenants) -> None:
@@ -397,9 +399,9 @@ def test_what_is_of_no_project_is_closed(tenants: Tenants, method: str, path: st
 
 def test_a_key_of_idempotency_is_of_its_project(tenants: Tenants) -> None:
     headers = {"Idempotency-Key": "one"}
-    made = tenants.beta.post("/v1/jobs", json=rods(gamma=(5.0,)), headers=headers)
-    assert made.status_code == 202
-    assert made.json()["id"] != tenants.parameters["job_id"]
+    response = tenants.beta.post("/v1/jobs", json=rods(gamma=(5.0,)), headers=headers)
+    assert response.status_code == 202
+    assert response.json()["id"] != tenants.parameters["job_id"]
     assert (
         tenants.alpha.post("/v1/jobs", json=rods(name="alpha-s"), headers=headers).status_code
         == 200
@@ -497,9 +499,9 @@ def test_only_requests_without_a_project_find_versions_without_a_job(context: Co
         "project": Principal("key-1 ada", everything_but_admin, "alpha"),
         "administrator": Principal("key-2 bert", frozenset({Scope.admin}), "alpha"),
     }
-    found = {}
+    visible = {}
     for name, principal in visible_to.items():
         with acting_as(principal), context.database.read() as connection:
             page = list_datasets(connection, PageRequest(10, None))
-            found[name] = [dataset.id for dataset in page.items]
-    assert found == {"nobody": ["ds-orphan"], "project": [], "administrator": ["ds-orphan"]}
+            visible[name] = [dataset.id for dataset in page.items]
+    assert visible == {"nobody": ["ds-orphan"], "project": [], "administrator": ["ds-orphan"]}

@@ -36,9 +36,9 @@ PROXIES = {
 @pytest.fixture(scope="module")
 def origin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str, str]]:
     """URL, job and dataset of a coordinator."""
-    made = make_app(Settings(data=tmp_path_factory.mktemp("origin"), durable=False))
-    with serving(made) as url, Client(url) as client:
-        context = made.state.context
+    app = make_app(Settings(data=tmp_path_factory.mktemp("origin"), durable=False))
+    with serving(app) as url, Client(url) as client:
+        context = app.state.context
         worker = PretendWorker(DirectApi(context), context.store, whole=True).register()
         job = client.submit(rods(gamma=(1.0, 2.0), name="a-name-as-long-as-people-like-them"))
         worker.work()
@@ -67,16 +67,16 @@ EVERY = [(), *(words for name in _COMMANDS if name not in PASSED_ON for words in
 
 @pytest.mark.parametrize("words", EVERY, ids=lambda words: " ".join(words) or "stickslip")
 def test_every_help_fits_and_cuts_no_sentence(words: tuple[str, ...]) -> None:
-    shown = run("", *words, "--help")
-    assert shown.exit_code == 0
-    wide = [line for line in shown.stdout.splitlines() if len(line) > WIDTH]
+    result = run("", *words, "--help")
+    assert result.exit_code == 0
+    wide = [line for line in result.stdout.splitlines() if len(line) > WIDTH]
     assert wide == []
-    assert "..." not in shown.stdout.replace("]...", "").replace("FILES...", "")
+    assert "..." not in result.stdout.replace("]...", "").replace("FILES...", "")
 
 
 def test_commands_are_listed_in_sections() -> None:
-    shown = run("", "--help").stdout
-    heads = [line for line in shown.splitlines() if line.endswith(":") and line[0] != " "]
+    output = run("", "--help").stdout
+    heads = [line for line in output.splitlines() if line.endswith(":") and line[0] != " "]
     assert heads == [
         "Options:",
         "Service:",
@@ -90,7 +90,7 @@ def test_commands_are_listed_in_sections() -> None:
         "Maintenance:",
     ]
     for name in _COMMANDS:
-        assert f"\n  {name} " in shown
+        assert f"\n  {name} " in output
 
 
 def test_every_table_fits(origin: tuple[str, str, str], tmp_path: Path) -> None:
@@ -116,12 +116,12 @@ def test_every_table_fits(origin: tuple[str, str, str], tmp_path: Path) -> None:
         ("audit-log", *data),
     ]
     for words in commands:
-        shown = run(url, *words)
-        lines = (shown.stdout + shown.stderr).splitlines()
+        result = run(url, *words)
+        lines = (result.stdout + result.stderr).splitlines()
         # A path or a URL is one word, and breaking it would make it useless.
         wide = [line for line in lines if len(line) > WIDTH and len(line.split()) > 1]
         assert wide == [], words
-        assert "Traceback" not in shown.output
+        assert "Traceback" not in result.output
 
 
 @pytest.mark.parametrize("width", ["20", "40", "80", "132"])
@@ -130,9 +130,9 @@ def test_a_table_fits_any_width(width: str, monkeypatch: pytest.MonkeyPatch, cap
     output.print_table(("file", "fault", "detail"), [("x" * 50, "size", "y" * 200)], sentences=True)
     output.print_table(("a", "b"), [("z" * 200, "q")])
     output.print_fields([("digest of the spec", "f" * 64)])
-    shown = capsys.readouterr()
-    assert max(map(len, shown.out.splitlines())) <= int(width)
-    assert shown.out.count("f") >= 64
+    captured = capsys.readouterr()
+    assert max(map(len, captured.out.splitlines())) <= int(width)
+    assert captured.out.count("f") >= 64
 
 
 @pytest.mark.real
@@ -152,11 +152,11 @@ def test_a_reader_that_goes_away_is_no_error(
 
 def test_watching_an_ended_job_shows_its_end(origin: tuple[str, str, str]) -> None:
     url, job, dataset = origin
-    shown = run(url, "watch", job)
-    assert shown.exit_code == 0
-    assert shown.stdout.splitlines()[0] == f"published {dataset}:v1"
-    assert shown.stdout.splitlines()[-1] == f"{job}: succeeded"
-    assert "simulate" not in shown.stdout
+    result = run(url, "watch", job)
+    assert result.exit_code == 0
+    assert result.stdout.splitlines()[0] == f"published {dataset}:v1"
+    assert result.stdout.splitlines()[-1] == f"{job}: succeeded"
+    assert "simulate" not in result.stdout
     events = [json.loads(line) for line in run(url, "watch", job, "--json").stdout.splitlines()]
     assert [event["event"] for event in events] == ["dataset.published", "job.state"]
     assert events[0]["dataset"]["dataset"] == dataset
@@ -189,10 +189,10 @@ def test_a_dead_proxy_does_not_stand_before_this_machine(
 
 def test_a_dead_proxy_before_another_machine_is_named() -> None:
     proxies = {"http_proxy": "http://me:hidden@127.0.0.1:9", "HTTP_PROXY": "", "no_proxy": ""}
-    shown = run("http://stick.example.org", "jobs", **proxies, COLUMNS="300")
-    assert shown.exit_code == 1
-    assert "through the proxy http://127.0.0.1:9 of the variable http_proxy" in shown.stderr
-    assert "hidden" not in shown.output
+    result = run("http://stick.example.org", "jobs", **proxies, COLUMNS="300")
+    assert result.exit_code == 1
+    assert "through the proxy http://127.0.0.1:9 of the variable http_proxy" in result.stderr
+    assert "hidden" not in result.output
 
 
 @pytest.mark.parametrize("key", ["", " ", "\n"])
@@ -201,10 +201,10 @@ def test_an_empty_key_is_none(origin: tuple[str, str, str], key: str) -> None:
 
 
 def test_a_key_that_cannot_be_sent_is_not_shown(origin: tuple[str, str, str]) -> None:
-    shown = run(origin[0], "jobs", STICKSLIP_API_KEY="sek\nrit", COLUMNS="300")
-    assert shown.exit_code == 1
-    assert "the API key has a space, a line break" in shown.stderr
-    assert "rit" not in shown.stderr.replace("sk_", "").replace("written", "")
+    result = run(origin[0], "jobs", STICKSLIP_API_KEY="sek\nrit", COLUMNS="300")
+    assert result.exit_code == 1
+    assert "the API key has a space, a line break" in result.stderr
+    assert "rit" not in result.stderr.replace("sk_", "").replace("written", "")
 
 
 ATTACK = "\x1b]0;owned\x07 \x9b31m red‮gnihton"
@@ -256,10 +256,10 @@ def test_text_of_a_server_cannot_steer_the_terminal(ascii_only: bool) -> None:
     body = json.dumps(problem, ensure_ascii=ascii_only).encode()
     with answering(lambda _: (422, "application/problem+json", body)) as url:
         for words in (("jobs",), ("show", "job-0"), ("datasets", "--latest")):
-            shown = run(url, *words)
-            assert shown.exit_code == 1
-            assert "owned" in shown.output
-            assert not {"\x1b", "\x07", "\x9b", "‮"} & set(shown.output)
+            result = run(url, *words)
+            assert result.exit_code == 1
+            assert "owned" in result.output
+            assert not {"\x1b", "\x07", "\x9b", "‮"} & set(result.output)
 
 
 def test_tables_of_a_hostile_server_are_clean(origin: tuple[str, str, str]) -> None:
@@ -269,11 +269,11 @@ def test_tables_of_a_hostile_server_are_clean(origin: tuple[str, str, str]) -> N
     body = json.dumps(page).encode()
     with answering(lambda _: (200, "application/json", body)) as url:
         for words in (("jobs",), ("jobs", "--json")):
-            shown = run(url, *words, COLUMNS="300")
-            assert shown.exit_code == 0
-            assert "owned" in shown.stdout
-            assert not {"\x1b", "\x07", "\x9b", "‮"} & set(shown.output)
-            assert "\nerror: do" not in shown.output
+            result = run(url, *words, COLUMNS="300")
+            assert result.exit_code == 0
+            assert "owned" in result.stdout
+            assert not {"\x1b", "\x07", "\x9b", "‮"} & set(result.output)
+            assert "\nerror: do" not in result.output
 
 
 @pytest.mark.parametrize("fault", ["endless", "gzip"])
@@ -288,11 +288,11 @@ def test_an_event_stream_that_is_no_stream(origin: tuple[str, str, str], fault: 
         return 200, "text/event-stream", b"data: " + b"x" * 2**22
 
     with answering(answer, {"Content-Encoding": "gzip"} if fault == "gzip" else {}) as url:
-        shown = run(url, "watch", job["id"], COLUMNS="300")
-    assert shown.exit_code == 1
+        result = run(url, "watch", job["id"], COLUMNS="300")
+    assert result.exit_code == 1
     expected = "compressed body" if fault == "gzip" else "sent an event of over 1048576 bytes"
-    assert expected in shown.stderr
-    assert isinstance(shown.exception, SystemExit)
+    assert expected in result.stderr
+    assert isinstance(result.exception, SystemExit)
 
 
 def test_ordinary_text_stays_as_it_is() -> None:

@@ -57,8 +57,8 @@ def _spec(texture: str, **more: Any) -> dict[str, Any]:
 @pytest.fixture
 def client(shared_server: RunningServer) -> Iterator[Client]:
     shared_server.worker(kinds=KINDS)
-    with Client(shared_server.url) as made:
-        yield made
+    with Client(shared_server.url) as client_:
+        yield client_
 
 
 def test_a_texture_is_uploaded_once_and_named_by_a_spec(
@@ -145,26 +145,26 @@ def test_the_command_line_uploads_and_says_what_to_write(
 def test_renders_of_one_trace_name_their_pictures(context: Context) -> None:
     worker = PretendWorker(DirectApi(context), context.store, kinds=KINDS).register()
     digest = context.store.publish(_png())
-    seen: list[str] = []
+    variants: list[str] = []
 
     def look(task: Any) -> None:
         if isinstance(task, RenderTask):
-            seen.append(task.render.variant)
+            variants.append(task.render.variant)
 
     worker.judge = look
     job = submit_job(context, parsed(_spec(f"sha256:{digest}")), None)
     assert isinstance(job, JobDetail)
     worker.work()
-    assert sorted(seen) == ["dots", f"sha256:{digest}"]
+    assert sorted(variants) == ["dots", f"sha256:{digest}"]
 
 
 def test_a_texture_that_a_job_names_is_kept(context: Context) -> None:
     """Also of a job that waits for the first worker, and so has no tasks yet."""
-    kept, other = (context.store.publish(_png(seed=seed)) for seed in (3, 4))
-    submit_job(context, parsed(_spec(f"sha256:{kept}")), None)
+    needed, other = (context.store.publish(_png(seed=seed)) for seed in (3, 4))
+    submit_job(context, parsed(_spec(f"sha256:{needed}")), None)
     with pytest.raises(
         UnknownFileError, match="/textures/logo: must name a file that was uploaded"
     ):
         submit_job(context, parsed(_spec(f"sha256:{'1' * 64}")), None)
-    found = [file.name for file in unused(context.database, context.store, older_than=-1)]
-    assert found == [other]
+    names = [file.name for file in unused(context.database, context.store, older_than=-1)]
+    assert names == [other]

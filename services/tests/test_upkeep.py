@@ -44,7 +44,7 @@ def submitted(context: Context, gamma: tuple[float, ...]) -> JobDetail:
 
 
 @pytest.fixture
-def made(settings: Settings) -> list[str]:
+def dataset_ids(settings: Settings) -> list[str]:
     """Two datasets that share two of their four simulations each; return their ids.
 
     The coordinator has ended.
@@ -90,7 +90,7 @@ def look(settings: Settings) -> tuple[list[str], list[Any], Context]:
         return violations(connection), list(list_datasets(context)), context
 
 
-def test_nothing_that_is_in_use_is_unused(settings: Settings, made: list[str]) -> None:
+def test_nothing_that_is_in_use_is_unused(settings: Settings, dataset_ids: list[str]) -> None:
     before = artifacts(settings)
     _, datasets, context = look(settings)
     for dataset in datasets:
@@ -104,8 +104,10 @@ def test_nothing_that_is_in_use_is_unused(settings: Settings, made: list[str]) -
     assert artifacts(settings) == before
 
 
-def test_a_removed_version_frees_what_only_it_needed(settings: Settings, made: list[str]) -> None:
-    first, second = made
+def test_a_removed_version_frees_what_only_it_needed(
+    settings: Settings, dataset_ids: list[str]
+) -> None:
+    first, second = dataset_ids
     before = artifacts(settings)
     result = run(settings, "rm", f"{first}:v1")
     assert result.exit_code == 0, result.stderr
@@ -128,10 +130,10 @@ def test_a_removed_version_frees_what_only_it_needed(settings: Settings, made: l
     context.close()
 
 
-def test_a_removed_dataset_is_made_again(settings: Settings, made: list[str]) -> None:
-    manifest = Path(settings.store_place) / "datasets" / made[0] / "v1" / MANIFEST_NAME
+def test_a_removed_dataset_is_made_again(settings: Settings, dataset_ids: list[str]) -> None:
+    manifest = Path(settings.store_place) / "datasets" / dataset_ids[0] / "v1" / MANIFEST_NAME
     content = manifest.read_bytes()
-    run(settings, "rm", f"{made[0]}:v1")
+    run(settings, "rm", f"{dataset_ids[0]}:v1")
     run(settings, "gc", "--delete", "--older-than", 0)
     _, _, context = look(settings)
     worker = PretendWorker(DirectApi(context), context.store).register()
@@ -146,7 +148,7 @@ def test_a_removed_dataset_is_made_again(settings: Settings, made: list[str]) ->
     context.close()
 
 
-def test_young_files_are_kept(settings: Settings, made: list[str]) -> None:
+def test_young_files_are_kept(settings: Settings, dataset_ids: list[str]) -> None:
     stray = Path(settings.store_place) / "artifacts" / "ab" / ("ab" + "0" * 62)
     scratch = stray.with_name(f".{stray.name}.0123.tmp")
     for path in (stray, scratch):
@@ -162,24 +164,26 @@ def test_young_files_are_kept(settings: Settings, made: list[str]) -> None:
 
 
 def test_the_files_of_a_version_that_the_database_does_not_know_are_kept(
-    settings: Settings, made: list[str]
+    settings: Settings, dataset_ids: list[str]
 ) -> None:
     """As after a database was restored from an old backup."""
-    directory = Path(settings.store_place) / "datasets" / made[0] / "v1"
+    directory = Path(settings.store_place) / "datasets" / dataset_ids[0] / "v1"
     away = settings.data / "away"
     directory.rename(away)
-    run(settings, "rm", f"{made[0]}:v1")
+    run(settings, "rm", f"{dataset_ids[0]}:v1")
     away.mkdir(exist_ok=True)
     directory.parent.mkdir(exist_ok=True)
     away.rename(directory)
     run(settings, "gc", "--delete", "--older-than", 0)
     assert CliRunner().invoke(app, ["verify", str(directory)]).exit_code == 0
     with opened(settings, Role.upkeep) as database:
-        found = reindex(database, DirectoryStore(settings.store_place))
-        assert sorted(version.is_new for version in found) == [False, True]
+        indexed = reindex(database, DirectoryStore(settings.store_place))
+        assert sorted(version.is_new for version in indexed) == [False, True]
 
 
-def test_a_manifest_that_cannot_be_read_stops_it(settings: Settings, made: list[str]) -> None:
+def test_a_manifest_that_cannot_be_read_stops_it(
+    settings: Settings, dataset_ids: list[str]
+) -> None:
     _, datasets, context = look(settings)
     context.close()
     context.store.delete(datasets[0].versions[0].manifest)
@@ -190,17 +194,21 @@ def test_a_manifest_that_cannot_be_read_stops_it(settings: Settings, made: list[
     assert artifacts(settings) == before
 
 
-def test_a_version_that_is_being_made_is_not_removed(settings: Settings, made: list[str]) -> None:
+def test_a_version_that_is_being_made_is_not_removed(
+    settings: Settings, dataset_ids: list[str]
+) -> None:
     _, datasets, context = look(settings)
     PretendWorker(DirectApi(context), context.store).register()
-    (version,) = next(dataset.versions for dataset in datasets if dataset.id == made[0])
+    (version,) = next(dataset.versions for dataset in datasets if dataset.id == dataset_ids[0])
     context.store.delete(version.manifest)  # so that a job makes it once more
     again = submitted(context, (1.0, 2.0))
     context.close()
-    result = run(settings, "rm", f"{made[0]}:v1")
+    result = run(settings, "rm", f"{dataset_ids[0]}:v1")
     assert result.exit_code == 1
     assert f"the job {again.id} is" in result.stderr
-    assert (Path(settings.store_place) / "datasets" / made[0] / "v1" / MANIFEST_NAME).exists()
+    assert (
+        Path(settings.store_place) / "datasets" / dataset_ids[0] / "v1" / MANIFEST_NAME
+    ).exists()
 
 
 @pytest.mark.parametrize(
@@ -215,13 +223,13 @@ def test_a_version_that_is_being_made_is_not_removed(settings: Settings, made: l
     ],
 )
 def test_what_does_not_exist_is_refused(
-    settings: Settings, made: list[str], arguments: tuple[str, ...], message: str
+    settings: Settings, dataset_ids: list[str], arguments: tuple[str, ...], message: str
 ) -> None:
     result = run(settings, *arguments)
     assert (result.exit_code, message in result.stderr) == (1, True), result.stderr
 
 
-def test_a_running_service_is_refused(settings: Settings, made: list[str]) -> None:
+def test_a_running_service_is_refused(settings: Settings, dataset_ids: list[str]) -> None:
     with locked(settings.data):
         result = run(settings, "gc")
     assert (result.exit_code, "is in use by another" in result.stderr) == (1, True)
@@ -232,7 +240,7 @@ def test_a_missing_database_is_refused(tmp_path: Path) -> None:
     assert (empty.exit_code, "does not exist" in empty.stderr) == (1, True)
 
 
-def mend(context: Context) -> None:
+def finish_repairs(context: Context) -> None:
     """Let a service with a worker go on until no job is left."""
     worker = PretendWorker(DirectApi(context), context.store).register()
     for _ in range(12):
@@ -246,40 +254,42 @@ def mend(context: Context) -> None:
 
 
 def test_scrubbing_finds_all_rot_and_it_is_mended_in_all_versions(
-    settings: Settings, made: list[str]
+    settings: Settings, dataset_ids: list[str]
 ) -> None:
     """The versions share files by their bytes, as hard links do."""
     rng = random.Random(5)
-    shown = sorted(
+    paths = sorted(
         path for path in (Path(settings.store_place) / "datasets").rglob("*") if path.is_file()
     )
-    before = {path: path.read_bytes() for path in shown}
+    before = {path: path.read_bytes() for path in paths}
     for round_ in range(5):
-        rotten = {path for path in rng.sample(shown, 4) if path.stat().st_size}
+        rotten = {path for path in rng.sample(paths, 4) if path.stat().st_size}
         for path in rotten:
             data = bytearray(path.read_bytes())
             data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
             path.write_bytes(data)
-        found = run(settings, "scrub", "--rate", 1000)
-        assert found.exit_code == 1, round_
-        damaged = {path for path in shown if path.read_bytes() != before[path]}
-        told = {tuple(line.split("  ")) for line in found.stdout.splitlines()}
+        result = run(settings, "scrub", "--rate", 1000)
+        assert result.exit_code == 1, round_
+        damaged = {path for path in paths if path.read_bytes() != before[path]}
+        reported = {tuple(line.split("  ")) for line in result.stdout.splitlines()}
         for path in damaged:
             dataset, version, *names = path.relative_to(
                 Path(settings.store_place) / "datasets"
             ).parts
-            listed = {name for one, name in told if one == f"{dataset}:{version}"}
+            listed = {
+                name for version_name, name in reported if version_name == f"{dataset}:{version}"
+            }
             assert listed & {"/".join(names), MANIFEST_NAME}
         clock = ManualClock()
         clock.now = time.time() + 3600  # a clock that is ahead
         context = Context.open(settings, clock)
-        mend(context)
+        finish_repairs(context)
         context.close()
         assert all(path.read_bytes() == data for path, data in before.items())
         assert run(settings, "scrub").exit_code == 0
 
 
-def test_a_coordinator_scrubs_when_it_is_idle(settings: Settings, made: list[str]) -> None:
+def test_a_coordinator_scrubs_when_it_is_idle(settings: Settings, dataset_ids: list[str]) -> None:
     context = Context.open(settings, ManualClock())
     now = context.clock()
     with context.database.write() as connection:
@@ -287,14 +297,16 @@ def test_a_coordinator_scrubs_when_it_is_idle(settings: Settings, made: list[str
     assert scrub(context, before=now - EVERY_SECONDS) is None  # they have just been made
     with context.database.write() as connection:
         connection.execute(update(dataset_versions).values(scrubbed_at=now - EVERY_SECONDS - 1))
-    (Path(settings.store_place) / "datasets" / made[0] / "v1" / "README.md").write_bytes(b"rot")
+    (Path(settings.store_place) / "datasets" / dataset_ids[0] / "v1" / "README.md").write_bytes(
+        b"rot"
+    )
     submitted(context, (7.0,))
     scrub_when_idle(context)  # a job runs
     assert scrubbed(context) == []
-    mend(context)
+    finish_repairs(context)
     for count in (2, 3, 3):
         scrub_when_idle(context)
-        mend(context)
+        finish_repairs(context)
         assert len(scrubbed(context)) == count
     assert run(settings, "scrub").exit_code == 0
     context.close()

@@ -65,10 +65,10 @@ class Receiver:
         threading.Thread(target=self._server.serve_forever, daemon=True).start()
 
     @property
-    def told(self) -> list[tuple[str, str]]:
+    def messages(self) -> list[tuple[str, str]]:
         """The sort of each message, and the state or the dataset that it tells."""
         documents = [json.loads(body) for _, body in self.received]
-        return [(one["type"], one["data"].get("state", "v1")) for one in documents]
+        return [(document["type"], document["data"].get("state", "v1")) for document in documents]
 
     def close(self) -> None:
         self._server.shutdown()
@@ -77,9 +77,9 @@ class Receiver:
 
 @pytest.fixture
 def receiver() -> Iterator[Receiver]:
-    made = Receiver()
-    yield made
-    made.close()
+    registered = Receiver()
+    yield registered
+    registered.close()
 
 
 @pytest.fixture
@@ -90,7 +90,7 @@ def messenger(context: Context, monkeypatch: pytest.MonkeyPatch) -> WebhookDeliv
     return WebhookDelivery(context.database, context.clock, sealer(context.settings))
 
 
-def made(context: Context, url: str) -> tuple[str, str]:
+def registered(context: Context, url: str) -> tuple[str, str]:
     """Make a webhook; return its id and its secret."""
     with context.database.write() as connection:
         webhook, secret = create_webhook(connection, sealer(context.settings), url, context.clock())
@@ -109,13 +109,15 @@ def test_what_happens_is_told_in_order_and_signed(
     context: Context, worker: PretendWorker, messenger: WebhookDelivery, receiver: Receiver
 ) -> None:
     run_job(context, worker, 1.0)  # before anybody wanted to know
-    name, secret = made(context, receiver.url)
+    name, secret = registered(context, receiver.url)
     messenger.run()
-    assert receiver.told == []
+    assert receiver.messages == []
     run_job(context, worker, 2.0)
     messenger.run()
     messenger.run()
-    assert [one for one in receiver.told if one != ("job.state", "queued")] == ONE_JOB
+    assert [
+        message for message in receiver.messages if message != ("job.state", "queued")
+    ] == ONE_JOB
     ids = [headers["webhook-id"] for headers, _ in receiver.received]
     assert len(set(ids)) == len(ids)
     for headers, body in receiver.received:
@@ -138,7 +140,7 @@ def test_a_message_that_fails_holds_up_the_others_and_is_sent_again(
     messenger: WebhookDelivery,
     receiver: Receiver,
 ) -> None:
-    made(context, receiver.url)
+    registered(context, receiver.url)
     receiver.status = 500
     run_job(context, worker, 1.0)
     for wait in (*WAITS, WAITS[-1]):
@@ -152,16 +154,18 @@ def test_a_message_that_fails_holds_up_the_others_and_is_sent_again(
         clock.advance(1)
     assert len({headers["webhook-id"] for headers, _ in receiver.received}) == 1
     with context.database.read() as connection:
-        (shown,) = list_webhooks(connection, clock())
-    assert (shown.failures, shown.is_given_up) == (len(WAITS) + 1, False)
-    assert shown.fault == "the receiver answered 500, and 2xx was expected"
+        (hook,) = list_webhooks(connection, clock())
+    assert (hook.failures, hook.is_given_up) == (len(WAITS) + 1, False)
+    assert hook.fault == "the receiver answered 500, and 2xx was expected"
     receiver.status = 200
     receiver.received.clear()
     messenger.run()
-    assert [one for one in receiver.told if one != ("job.state", "queued")] == ONE_JOB
+    assert [
+        message for message in receiver.messages if message != ("job.state", "queued")
+    ] == ONE_JOB
     with context.database.read() as connection:
-        (shown,) = list_webhooks(connection, clock())
-    assert (shown.failures, shown.failing_since, shown.fault) == (0, None, "")
+        (hook,) = list_webhooks(connection, clock())
+    assert (hook.failures, hook.failing_since, hook.fault) == (0, None, "")
 
 
 def test_a_receiver_that_is_away_for_days_is_given_up_until_somebody_says_otherwise(
@@ -171,7 +175,7 @@ def test_a_receiver_that_is_away_for_days_is_given_up_until_somebody_says_otherw
     messenger: WebhookDelivery,
     receiver: Receiver,
 ) -> None:
-    name, _ = made(context, receiver.url)
+    name, _ = registered(context, receiver.url)
     receiver.status = 503
     run_job(context, worker, 1.0)
     end = clock() + GIVE_UP_SECONDS
@@ -186,7 +190,9 @@ def test_a_receiver_that_is_away_for_days_is_given_up_until_somebody_says_otherw
         assert list_webhooks(connection, clock())[0].is_given_up
         retry_webhook(connection, name, clock())
     messenger.run()
-    assert [one for one in receiver.told if one != ("job.state", "queued")] == ONE_JOB
+    assert [
+        message for message in receiver.messages if message != ("job.state", "queued")
+    ] == ONE_JOB
 
 
 def test_nobody_is_told_twice_by_two_coordinators_and_the_other_goes_on_when_one_dies(
@@ -196,19 +202,21 @@ def test_nobody_is_told_twice_by_two_coordinators_and_the_other_goes_on_when_one
     messenger: WebhookDelivery,
     receiver: Receiver,
 ) -> None:
-    made(context, receiver.url)
+    registered(context, receiver.url)
     run_job(context, worker, 1.0)
     other = WebhookDelivery(context.database, context.clock, sealer(context.settings))
     assert messenger._claim(1)  # and here it is killed
     other.run()
     assert receiver.received == []
     clock.advance(CLAIM_SECONDS)
-    threads = [threading.Thread(target=one.run) for one in (messenger, other)]
+    threads = [threading.Thread(target=delivery.run) for delivery in (messenger, other)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert [one for one in receiver.told if one != ("job.state", "queued")] == ONE_JOB
+    assert [
+        delivery for delivery in receiver.messages if delivery != ("job.state", "queued")
+    ] == ONE_JOB
 
 
 @pytest.mark.parametrize(("stopped", "wait"), [(False, WAITS[0]), (True, 0.0)])
@@ -222,7 +230,7 @@ def test_a_delivery_that_ends_in_its_middle_is_tried_again_without_the_wait_of_i
     wait: float,
 ) -> None:
     monkeypatch.setattr(webhooks, "WAIT_SECONDS", 20.0)
-    made(context, receiver.url)
+    registered(context, receiver.url)
     run_job(context, worker, 1.0)
     messenger = WebhookDelivery(context.database, context.clock, sealer(context.settings))
     if stopped:
@@ -237,7 +245,9 @@ def test_a_delivery_that_ends_in_its_middle_is_tried_again_without_the_wait_of_i
         assert receiver.received == []
     clock.advance(wait)
     other.run()
-    assert [one for one in receiver.told if one != ("job.state", "queued")] == ONE_JOB
+    assert [
+        message for message in receiver.messages if message != ("job.state", "queued")
+    ] == ONE_JOB
 
 
 def test_a_copy_of_the_database_has_no_secret(
@@ -247,7 +257,7 @@ def test_a_copy_of_the_database_has_no_secret(
     messenger: WebhookDelivery,
     receiver: Receiver,
 ) -> None:
-    name, secret = made(context, receiver.url)
+    name, secret = registered(context, receiver.url)
     with context.database.read() as connection:
         sealed = connection.scalar(
             select(tables.webhooks.c.secret).where(tables.webhooks.c.id == name)
@@ -259,16 +269,18 @@ def test_a_copy_of_the_database_has_no_secret(
     run_job(context, worker, 1.0)
     WebhookDelivery(context.database, context.clock, Fernet(Fernet.generate_key())).run()
     wait_until(lambda: "sealed with another secrets key" in fault_of(context, name))
-    assert receiver.told == []
+    assert receiver.messages == []
     clock.advance(WAITS[0])
     messenger.run()
-    assert receiver.told != []
+    assert receiver.messages != []
 
 
 def fault_of(context: Context, name: str) -> str:
     with context.database.read() as connection:
         return next(
-            str(one.fault) for one in list_webhooks(connection, context.clock()) if one.id == name
+            str(hook.fault)
+            for hook in list_webhooks(connection, context.clock())
+            if hook.id == name
         )
 
 
@@ -280,12 +292,12 @@ def test_a_receiver_that_does_not_listen_is_a_fault_and_no_error(
     receiver: Receiver,
 ) -> None:
     receiver.close()
-    made(context, receiver.url)
+    registered(context, receiver.url)
     run_job(context, worker, 1.0)
     messenger.run()
     with context.database.read() as connection:
-        (shown,) = list_webhooks(connection, clock())
-    assert "ConnectError" in shown.fault
+        (hook,) = list_webhooks(connection, clock())
+    assert "ConnectError" in hook.fault
 
 
 def test_a_receiver_that_trickles_holds_up_no_other(
@@ -300,13 +312,14 @@ def test_a_receiver_that_trickles_holds_up_no_other(
     monkeypatch.setattr(webhooks, "WAIT_SECONDS", 0.2)
     with socket.create_server(("127.0.0.1", 0)) as slow:
         threading.Thread(target=trickle, args=(slow,), daemon=True).start()
-        slow_hook, _ = made(context, f"http://127.0.0.1:{slow.getsockname()[1]}/")
-        made(context, receiver.url)
+        slow_hook, _ = registered(context, f"http://127.0.0.1:{slow.getsockname()[1]}/")
+        registered(context, receiver.url)
         run_job(context, worker, 1.0)
         began = time.monotonic()
         messenger.run()
         wait_until(
-            lambda: [one for one in receiver.told if one[1] != "queued"] == ONE_JOB, seconds=3
+            lambda: [message for message in receiver.messages if message[1] != "queued"] == ONE_JOB,
+            seconds=3,
         )
         assert time.monotonic() - began < 3.8
 
@@ -326,7 +339,7 @@ def trickle(server: socket.socket) -> None:
 )
 def test_urls_that_anybody_could_read_are_refused(context: Context, url: str) -> None:
     with pytest.raises(SettingsError, match="url must be https"):
-        made(context, url)
+        registered(context, url)
 
 
 def test_the_command_line_makes_and_a_coordinator_delivers(
@@ -344,7 +357,7 @@ def test_the_command_line_makes_and_a_coordinator_delivers(
     httpx.post(f"{server.url}/v1/jobs", json=rods(), trust_env=False).raise_for_status()
     worker = server.worker()
     wait_until(lambda: worker.work() > 0)
-    wait_until(lambda: receiver.told[-1:] == [("job.state", "succeeded")])
+    wait_until(lambda: receiver.messages[-1:] == [("job.state", "succeeded")])
     for headers, body in receiver.received:
         Verifier(secret).verify(body, headers)
     (name,) = (word for word in listed.split() if word.startswith("hook-"))

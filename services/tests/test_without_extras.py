@@ -51,7 +51,7 @@ def test_the_command_line_needs_no_extra() -> None:
 
 @pytest.mark.real
 @pytest.mark.parametrize(
-    ("example", "status", "said"),
+    ("example", "status", "message"),
     [
         ("thesis-rods.yaml", 0, "10000 (train"),
         ("demo-cloth.yaml", 0, "the spec is valid"),
@@ -63,7 +63,7 @@ def test_the_command_line_needs_no_extra() -> None:
     ],
 )
 def test_specs_are_checked_without_arrays_unless_their_axes_are_drawn(
-    example: str, status: int, said: str
+    example: str, status: int, message: str
 ) -> None:
     words = [
         "stickslip",
@@ -75,7 +75,7 @@ def test_specs_are_checked_without_arrays_unless_their_axes_are_drawn(
     done = run_without_extras(f"from stickslip_services.cli import app\nsys.argv = {words}\napp()")
     # Lines are wrapped at the width of the terminal.
     words_said = " ".join((done.stdout + done.stderr).split())
-    assert (done.returncode, said in words_said) == (status, True), done.stderr
+    assert (done.returncode, message in words_said) == (status, True), done.stderr
 
 
 @pytest.mark.real

@@ -403,10 +403,10 @@ def test_there_are_150_wrong_inputs() -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "status", "said"), FLAGS, ids=[words[:40] for words, _, _ in FLAGS]
+    ("words", "status", "message"), FLAGS, ids=[words[:40] for words, _, _ in FLAGS]
 )
 def test_a_wrong_flag_or_file_is_refused(
-    words: str, status: int, said: str, tmp_path: Path
+    words: str, status: int, message: str, tmp_path: Path
 ) -> None:
     for name, text in FILES.items():
         (tmp_path / f"{name}.yaml").write_text(text, encoding="utf-8", errors="surrogateescape")
@@ -416,8 +416,8 @@ def test_a_wrong_flag_or_file_is_refused(
         "OUT": [str(tmp_path / "out")],
         "HERE": [str(tmp_path)],
     }
-    given = [part for word in words.split() for part in known.get(word, [word])]
-    done = CliRunner().invoke(app, given, env={"COLUMNS": "250", "STICKSLIP_URL": OFFLINE[1]})
+    arguments = [part for word in words.split() for part in known.get(word, [word])]
+    done = CliRunner().invoke(app, arguments, env={"COLUMNS": "250", "STICKSLIP_URL": OFFLINE[1]})
     assert done.exit_code == status, done.output
-    assert said in done.output
+    assert message in done.output
     assert done.exception is None or isinstance(done.exception, SystemExit)

@@ -29,9 +29,9 @@ def configure(source: Path, build: Path, *options: str) -> str:
     command += [f"-Dnanobind_ROOT={site}/nanobind/cmake", "-DCMAKE_BUILD_TYPE=Release", *options]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
-    found = re.search(r"build hash ([0-9a-f]{64})", result.stdout)
-    assert found, result.stdout
-    return found[1]
+    match = re.search(r"build hash ([0-9a-f]{64})", result.stdout)
+    assert match, result.stdout
+    return match[1]
 
 
 def test_fields() -> None:

@@ -113,15 +113,17 @@ def touching(scene: str) -> str:
 def rods() -> str:
     """Solve 64 rods of the thesis's ranges."""
     gamma, phi0, phi1 = np.random.default_rng(1).uniform([100, 0.2, 6], [1300, 12, 20], (64, 3)).T
-    found = solve_rods(gamma, phi0, phi1)
-    return digest(found.centerline, found.curvature, found.frame, found.energy, found.stable)
+    solution = solve_rods(gamma, phi0, phi1)
+    return digest(
+        solution.centerline, solution.curvature, solution.frame, solution.energy, solution.stable
+    )
 
 
 def general_rods() -> str:
     """Solve 8 rods of varying natural curvature."""
     natural = np.random.default_rng(2).uniform(-8.0, 8.0, (8, 5, 3))
-    found = solve_general_rods(natural, np.linspace(50.0, 800.0, 8))
-    return digest(found.centerline, found.curvature, found.energy, found.stable)
+    solution = solve_general_rods(natural, np.linspace(50.0, 800.0, 8))
+    return digest(solution.centerline, solution.curvature, solution.energy, solution.stable)
 
 
 def general_rods_anywhere() -> str:
@@ -171,12 +173,15 @@ def results(kernel: str) -> dict[str, str]:
 @pytest.fixture(scope="module")
 def recorded() -> dict[str, Any]:
     """What is recorded, if this machine can be expected to give the same bits."""
-    found: dict[str, Any] = json.loads(RECORDED.read_text(encoding="utf-8"))
-    if platform.machine() not in ("x86_64", "AMD64") or build_info().compiler != found["compiler"]:
+    document: dict[str, Any] = json.loads(RECORDED.read_text(encoding="utf-8"))
+    if (
+        platform.machine() not in ("x86_64", "AMD64")
+        or build_info().compiler != document["compiler"]
+    ):
         pytest.skip(
-            f"recorded with {found['compiler']} on x86-64: others may give other last digits"
+            f"recorded with {document['compiler']} on x86-64: others may give other last digits"
         )
-    return found
+    return document
 
 
 @pytest.mark.parametrize("name", RODS)
@@ -193,16 +198,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--record", action="store_true")
     args = parser.parse_args()
-    found = {
+    digests = {
         "compiler": build_info().compiler,
         "rods": {name: scene() for name, scene in RODS.items()},
         "cloth": {kernel: results(kernel) for kernel in KERNELS},
     }
     if args.record:
-        RECORDED.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
+        RECORDED.write_text(json.dumps(digests, indent=2) + "\n", encoding="utf-8")
         return
     recorded = json.loads(RECORDED.read_text(encoding="utf-8"))
-    print("equal" if found == recorded else f"different:\n{json.dumps(found, indent=2)}")
+    print("equal" if digests == recorded else f"different:\n{json.dumps(digests, indent=2)}")
 
 
 if __name__ == "__main__":

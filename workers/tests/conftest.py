@@ -42,7 +42,7 @@ BUILDS = Builds(sim_core="0" * 64, simulate="1" * 64, render="2" * 64, pack="3" 
 
 
 @dataclass
-class Made:
+class PackedDataset:
     """A dataset before it is packed: `arrays` is what every reader must give back."""
 
     spec: RodHangSpec
@@ -79,12 +79,12 @@ def store(tmp_path: Path) -> DirectoryStore:
 
 
 @pytest.fixture
-def make_dataset(store: DirectoryStore) -> Callable[..., Made]:
+def make_dataset(store: DirectoryStore) -> Callable[..., PackedDataset]:
     """Make up a dataset: `make_dataset(count=7, per_shard=4, rejected=(2,), views=True)`."""
 
     def make(
         *, count: int = 7, per_shard: int = 4, rejected: tuple[int, ...] = (2,), views: bool = True
-    ) -> Made:
+    ) -> PackedDataset:
         rng = np.random.default_rng(count)
         spec = RodHangSpec.model_validate(
             {
@@ -154,7 +154,7 @@ def make_dataset(store: DirectoryStore) -> Callable[..., Made]:
             PackTask(spec=spec, shard=shard, slots=tuple(slots[first : first + per_shard]))
             for shard, first in enumerate(range(0, count, per_shard))
         ]
-        return Made(
+        return PackedDataset(
             spec, store, tasks, arrays, tuple(rejections), tuple(sample.key for sample in members)
         )
 

@@ -38,7 +38,7 @@ class CoordinatorDouble:
         self.changed = threading.Condition(self.lock)
         self.registrations: list[WorkerRegistration] = []
         self.waiting: list[tuple[str, Any]] = []
-        self.given: list[tuple[str, Any]] = []
+        self.leased_tasks: list[tuple[str, Any]] = []
         self.leased: dict[str, int] = {}
         self.started: set[str] = set()
         self.beats = 0
@@ -151,7 +151,7 @@ class CoordinatorDouble:
             else:
                 left.append((name, task))
         self.waiting = left
-        self.given += [(lease.task_id, lease.task) for lease in granted]
+        self.leased_tasks += [(lease.task_id, lease.task) for lease in granted]
         return LeaseBatch(leases=tuple(granted), retry_after_seconds=0 if granted else 0.05)
 
     def _beat(self, heartbeat: Heartbeat) -> HeartbeatAnswer:
@@ -178,7 +178,7 @@ class CoordinatorDouble:
                 self.released.append(report.task_id)
                 self.waiting += [
                     item
-                    for item in self.given
+                    for item in self.leased_tasks
                     if item[0] == report.task_id and item[0] in self.long
                 ]
             else:

@@ -29,15 +29,15 @@ class RenderActor:
 
     def render(self, task: dict[str, Any]) -> dict[str, Any]:
         job = RenderTask.model_validate(task)
-        what = job.render.color_seed
-        if what == DISK_FULL:
+        behaviour = job.render.color_seed
+        if behaviour == DISK_FULL:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "artifacts")
-        if what == BUG:
+        if behaviour == BUG:
             raise RuntimeError("a bug")
-        if what >= UNTIL_RELEASED:
-            print(f"waits for release-{what}", file=sys.stderr, flush=True)
-            (self._beside / f"pid-{what}").write_text(str(os.getpid()))
-            while not (self._beside / f"release-{what}").exists():
+        if behaviour >= UNTIL_RELEASED:
+            print(f"waits for release-{behaviour}", file=sys.stderr, flush=True)
+            (self._beside / f"pid-{behaviour}").write_text(str(os.getpid()))
+            while not (self._beside / f"release-{behaviour}").exists():
                 time.sleep(0.01)
         chunk = encode_chunk(bytes(4 * 224 * 224 * 3))
         output = RenderOutput(

@@ -119,13 +119,13 @@ def test_every_function_that_runs_is_in_the_build(name: str, tmp_path: Path) -> 
     task = {"stage": "simulate", "simulation": {"kind": name, **SIMULATIONS[name]}}
     answer = json.loads(_python(_RUN, json.dumps([task]), str(tmp_path)))
     assert answer["results"][0]["outcome"] == "succeeded", answer["results"]
-    ours = {
+    source_files = {
         Path(file).resolve()
         for file in answer["ran"]
         if "/stickslip_" in file and file.endswith(".py")
     }
-    assert len(ours) >= 5
-    left = {path for path in ours if not _decides_on_nothing(path)}
+    assert len(source_files) >= 5
+    left = {path for path in source_files if not _decides_on_nothing(path)}
     assert left <= _files("simulate", name), left - _files("simulate", name)
 
 
@@ -200,15 +200,21 @@ def test_a_new_fabric_makes_no_rod_again_and_a_new_texture_no_simulation(
 
 
 def test_every_build_is_another() -> None:
-    made = [builds.kind_builds(name) for name in KINDS]
+    builds_of_kinds = [builds.kind_builds(name) for name in KINDS]
     assert (
-        len({one["simulate"] for one in made}) == len({one["pack"] for one in made}) == len(KINDS)
+        len({build["simulate"] for build in builds_of_kinds})
+        == len({build["pack"] for build in builds_of_kinds})
+        == len(KINDS)
     )
 
 
 @pytest.mark.parametrize("name", KINDS)
 def test_a_certificate_is_of_the_solver_that_the_kind_uses(name: str) -> None:
-    presets = [preset for preset, made in CERTIFICATION.items() if made.solver == kind(name).solver]
+    presets = [
+        preset
+        for preset, certification in CERTIFICATION.items()
+        if certification.solver == kind(name).solver
+    ]
     assert presets
     assert builds.kind_builds(name)["sim_core"] == builds.solver_build(
         CERTIFICATION[presets[0]].solver

@@ -19,7 +19,7 @@ class Remote:
     """A remote function that only notes its options."""
 
     def options(self, **options: Any) -> "Remote":
-        self.given = options
+        self.last_options = options
         return self
 
     def remote(self, *_: Any) -> object:
@@ -44,11 +44,11 @@ def test_calls_that_have_not_started_are_given_again_when_a_node_is_lost(
         for name, node in zip("hlw", ("a", "b", ""), strict=True)
     )
     here.started_at = lost.started_at = time.monotonic()
-    calls._in_progress = {one.reference: one for one in (here, lost, waiting)}
+    calls._in_progress = {call.reference: call for call in (here, lost, waiting)}
     assert list(calls.check_nodes()) == []
     nodes[1]["Alive"] = False
-    said = {id(one): type(error) for one, error in calls.check_nodes()}
-    assert said == {id(lost): Failed, id(waiting): NotRun}
+    errors = {id(call): type(error) for call, error in calls.check_nodes()}
+    assert errors == {id(lost): Failed, id(waiting): NotRun}
     assert cancelled == ["w"]
     assert list(calls) == [here]
     assert list(calls.check_nodes()) == []
@@ -58,7 +58,7 @@ def test_calls_that_have_not_started_are_given_again_when_a_node_is_lost(
     remote = Remote()
     calls._stages = replace(calls._stages, remote=remote)
     calls.submit(Call(Stage.simulate, []))
-    assert remote.given["label_selector"] == {"ray.io/node-id": "!in(b)"}
+    assert remote.last_options["label_selector"] == {"ray.io/node-id": "!in(b)"}
 
 
 def _render_call(resolution: tuple[int, int], frames: int) -> Call:

@@ -21,7 +21,7 @@ LITTLE = {"rod-cantilever": {"gamma": (1.0, 100.0), "elements": 512}}
 @pytest.fixture
 def presets(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two presets that are quick to certify; the second protocol of one breaks off."""
-    made = {
+    presets_made = {
         "good": Certification(
             ("rod-lateral-buckling", "rod-cantilever"),
             ROD_SOLVER,
@@ -37,7 +37,7 @@ def presets(monkeypatch: pytest.MonkeyPatch) -> None:
             },
         ),
     }
-    monkeypatch.setattr(protocols, "CERTIFICATION", made)
+    monkeypatch.setattr(protocols, "CERTIFICATION", presets_made)
     monkeypatch.setattr(result, "POINTS", 5)  # of curves that are only drawn
 
 

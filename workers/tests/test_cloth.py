@@ -234,16 +234,16 @@ def make_clips(core: Core, store: DirectoryStore) -> Callable[..., Clips]:
                 slots.append(PackSlot(**common, split=sample.split, rejection=rejections[-1]))
                 continue
             (result,) = run_tasks([SimulateTask(simulation=sample.simulation)], store)
-            shown = {"light": 3, "floor": 8, "creases": (), "frame_share": (), "visible_share": ()}
-            shown |= {f"psnr_{region}": () for region in REGIONS} | {"psnr_deviation": 3}
-            seen = {
-                name: rng.random(size).astype(np.float32).tolist() for name, size in shown.items()
+            sizes = {"light": 3, "floor": 8, "creases": (), "frame_share": (), "visible_share": ()}
+            sizes |= {f"psnr_{region}": () for region in REGIONS} | {"psnr_deviation": 3}
+            measured = {
+                name: rng.random(size).astype(np.float32).tolist() for name, size in sizes.items()
             }
-            seen |= {"light_seed": i, "lighting": "drawn", "substrate": "ceramic"}
-            labels = sample.labels | result.output.labels | seen
+            measured |= {"light_seed": i, "lighting": "drawn", "substrate": "ceramic"}
+            labels = sample.labels | result.output.labels | measured
             arrays["valid"][i] = True
             codes = {"kernel": 0, "lighting": 0, "substrate": 3}
-            for name in (*result.output.labels, *seen):
+            for name in (*result.output.labels, *measured):
                 arrays[name][i] = codes.get(name, labels[name])
             for name, values in Records(store)(result.output.record.digest).items():
                 if name in arrays:
@@ -281,18 +281,18 @@ def make_clips(core: Core, store: DirectoryStore) -> Callable[..., Clips]:
 def test_files_are_those_of_zarr_python(
     make_clips: Callable[..., Clips], store: DirectoryStore, tmp_path: Path, store_positions: bool
 ) -> None:
-    made = make_clips(rejected=(2,), store_positions=store_positions)
+    clips = make_clips(rejected=(2,), store_positions=store_positions)
     packed = {
         file.path: store.read(file.sha256)
-        for task in made.pack_tasks
+        for task in clips.pack_tasks
         for file in pack(task, store).files
     }
     group = zarr.create_group(tmp_path / "zarr", zarr_format=3)
-    for array in layout(made.spec):
+    for array in layout(clips.spec):
         if array.is_label:  # written by the task that publishes
             continue
         with zarr.config.set({"array.write_empty_chunks": not array.per_sample}):
-            create_array(group, array, sample_count=6, samples_per_file=4)[:] = made.arrays[
+            create_array(group, array, sample_count=6, samples_per_file=4)[:] = clips.arrays[
                 array.name
             ]  # type: ignore[index]
     written = {
@@ -308,12 +308,12 @@ def test_files_are_those_of_zarr_python(
 def test_three_readers_give_back_what_went_in(
     make_clips: Callable[..., Clips], store: DirectoryStore
 ) -> None:
-    made = make_clips(rejected=(3,))
-    publish(made.publish_task([pack(task, store) for task in made.pack_tasks]), store)
-    directory = store.dataset_path(made.spec.dataset_id, 1)
+    clips = make_clips(rejected=(3,))
+    publish(clips.publish_task([pack(task, store) for task in clips.pack_tasks]), store)
+    directory = store.dataset_path(clips.spec.dataset_id, 1)
     group = zarr.open_group(directory, mode="r")
     with xarray.open_zarr(directory, chunks=None, mask_and_scale=False) as dataset:
-        for name, expected in made.arrays.items():
+        for name, expected in clips.arrays.items():
             spec = {
                 "driver": "zarr3",
                 "kvstore": {"driver": "file", "path": f"{directory / name}/"},
@@ -333,13 +333,14 @@ def test_three_readers_give_back_what_went_in(
                 median=round(float(np.median(values)), 2),
                 worst=round(float(np.quantile(values, 0.01)), 2),
                 deviation=round(
-                    float(np.median(made.arrays["psnr_deviation"][made.arrays["valid"], number])), 2
+                    float(np.median(clips.arrays["psnr_deviation"][clips.arrays["valid"], number])),
+                    2,
                 ),
             )
             for number, region in enumerate(REGIONS)
-            if (values := made.arrays[f"psnr_{region}"][made.arrays["valid"]]).size
+            if (values := clips.arrays[f"psnr_{region}"][clips.arrays["valid"]]).size
         },
-        frame_share=round(float(made.arrays["frame_share"][made.arrays["valid"]].mean()), 4),
+        frame_share=round(float(clips.arrays["frame_share"][clips.arrays["valid"]].mean()), 4),
         device="cpu",
     )
     card = (directory / "README.md").read_text()

@@ -99,8 +99,8 @@ def start(double: CoordinatorDouble, store: DirectoryStore, cluster: RayCluster)
         running.stop()
 
 
-def _render(what: int) -> RenderTask:
-    look = RodHangRender(rig="rod-4", rig_digest="0" * 64, quality="draft", color_seed=what)
+def _render(behaviour: int) -> RenderTask:
+    look = RodHangRender(rig="rod-4", rig_digest="0" * 64, quality="draft", color_seed=behaviour)
     return RenderTask(render=look, record=RecordRef(digest="0" * 64, row=0))
 
 
@@ -130,9 +130,9 @@ def _cloth() -> SimulateTask:
 HANG = fake_renderer.UNTIL_RELEASED
 
 
-def _wait_for_pid(double: CoordinatorDouble, store: DirectoryStore, what: int) -> int:
+def _wait_for_pid(double: CoordinatorDouble, store: DirectoryStore, behaviour: int) -> int:
     """Wait until the renderer is at work; heartbeats, which go on, are the clock."""
-    path = store.root / f"pid-{what}"
+    path = store.root / f"pid-{behaviour}"
     double.until(lambda: path.exists() and path.read_text() != "")
     return int(path.read_text())
 
@@ -140,20 +140,20 @@ def _wait_for_pid(double: CoordinatorDouble, store: DirectoryStore, what: int) -
 def test_runs_what_it_is_given_and_says_who_it_is(
     start: Start, double: CoordinatorDouble, store: DirectoryStore, make_dataset: Callable[..., Any]
 ) -> None:
-    made = make_dataset(count=5, per_shard=4)
+    dataset = make_dataset(count=5, per_shard=4)
     start()
     double.offer(
         **_simulate(700),
         picture=_render(fake_renderer.FINE),
-        shard=made.pack_tasks[0],
-        all=made.publish_task,
+        shard=dataset.pack_tasks[0],
+        all=dataset.publish_task,
     )
     double.until(lambda: len(double.results) == 703)
     assert {result.outcome for result in double.results.values()} == {"succeeded"}
     # The first calls are given little, to learn how long a rod takes; then 512 go together. Each
     # makes one artifact.
     assert len({double.results[f"rod-{i}"].output.record.digest for i in range(700)}) <= 10
-    assert (store.dataset_path(made.publish_task.dataset, 1) / "manifest.json").exists()
+    assert (store.dataset_path(dataset.publish_task.dataset, 1) / "manifest.json").exists()
     starting, registration = double.registrations
     assert (starting.builds, starting.condition.state) == ({}, "starting")
     assert starting.condition.reason.startswith("waiting for Ray: ")
@@ -226,8 +226,8 @@ def test_short_renders_share_a_call_and_only_what_fails_by_itself_fails(
     start(max_cpus=1)
     double.offer(first=_render(fake_renderer.FINE))
     double.until(lambda: "first" in double.results)
-    others = {f"fine-{i}": _render(fake_renderer.FINE) for i in range(3)}
-    double.offer(**others, crash=_render(HANG), bug=_render(fake_renderer.BUG))
+    further = {f"fine-{i}": _render(fake_renderer.FINE) for i in range(3)}
+    double.offer(**further, crash=_render(HANG), bug=_render(fake_renderer.BUG))
     together = _wait_for_pid(double, store, HANG)
     assert set(double.results) == {
         "first"

@@ -30,13 +30,13 @@ T = TypeVar("T")
 NAME = f"end-to-end-{os.getpid()}"
 
 
-def _wait_for(what: str, probe: Callable[[], T | None], timeout: float = 600) -> T:
+def _wait_for(condition: str, probe: Callable[[], T | None], timeout: float = 600) -> T:
     deadline = time.monotonic() + timeout
     while time.monotonic() < deadline:
         if (answer := probe()) is not None:
             return answer
         time.sleep(0.05)
-    raise AssertionError(f"waited {timeout} s in vain for {what}")
+    raise AssertionError(f"waited {timeout} s in vain for {condition}")
 
 
 class Services:
@@ -47,8 +47,8 @@ class Services:
         self._directory = directory
         self._processes: list[subprocess.Popen[bytes]] = []
         self._start("coordinator", "stickslip_services.app", "--data", directory, "--port", "0")
-        found = self._wait_for_line("coordinator", r"listening on (http://\S+)")
-        self.url = found[1]
+        match = self._wait_for_line("coordinator", r"listening on (http://\S+)")
+        self.url = match[1]
 
     def _start(self, log: str, *command: object) -> subprocess.Popen[bytes]:
         with (self._directory / f"{log}.log").open("wb") as file:
@@ -117,12 +117,12 @@ def services(tmp_path: Path) -> Iterator[Services]:
 
 def _processes() -> list[int]:
     """Return the processes of the Ray of the dispatchers."""
-    place, found = str(head_directory(Path(NAME))), []
+    place, pids = str(head_directory(Path(NAME))), []
     for entry in Path("/proc").iterdir():
         with contextlib.suppress(OSError):
             if entry.name.isdigit() and place in (entry / "cmdline").read_text(errors="replace"):
-                found.append(int(entry.name))
-    return found
+                pids.append(int(entry.name))
+    return pids
 
 
 def test_killing_the_dispatcher_loses_and_leaves_nothing(services: Services) -> None:

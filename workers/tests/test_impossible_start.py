@@ -141,8 +141,8 @@ def test_the_numbers_are_those_of_the_core() -> None:
     assert shapes.ROUNDING == contact.ROUNDING
     assert shapes.RADIUS_LEAST == contact.RADIUS_LEAST
     for size, cell in (([1, 1, 1], 0.001), ([1, 1, 1], 0.01), ([1, 1, 0.012], 0.01)):
-        mine = shapes.box_rounding({"size": size, "rounding": None}, cell)
-        assert mine == contact.default_rounding(size, cell)
+        rounding = shapes.box_rounding({"size": size, "rounding": None}, cell)
+        assert rounding == contact.default_rounding(size, cell)
     assert set(SHORTEST_STEPS) == set(presets.PRESETS)
     for name, settings in presets.PRESETS.items():
         shortest = settings.longest_step / settings.finest
@@ -190,12 +190,12 @@ def test_sheets_are_those_of_the_core() -> None:
             "start": {"type": "stretched", "strain": [0.05, -0.02]},
         }
     )
-    given = document["sheets"]["cloth"]
-    mine = start_of("cloth", given)
-    core = parts.sheet("cloth", given, {}, gravity=document["gravity"], seed=0, kernel=None)
-    assert mine.cell == pytest.approx(core.mesh.spacing, rel=1e-12)
-    np.testing.assert_allclose(mine.positions, core.start, atol=1e-15)
-    np.testing.assert_array_equal(mine.mesh.triangles, core.mesh.triangles)
+    sheet = document["sheets"]["cloth"]
+    start = start_of("cloth", sheet)
+    core = parts.sheet("cloth", sheet, {}, gravity=document["gravity"], seed=0, kernel=None)
+    assert start.cell == pytest.approx(core.mesh.spacing, rel=1e-12)
+    np.testing.assert_allclose(start.positions, core.start, atol=1e-15)
+    np.testing.assert_array_equal(start.mesh.triangles, core.mesh.triangles)
 
 
 def test_a_scattered_sheet_is_within_its_jitter() -> None:

@@ -87,9 +87,9 @@ def _lease(token: int) -> Lease:
 def test_a_late_drop_spares_a_newer_lease() -> None:
     table = LeaseTable()
     table.add([_lease(1)])
-    said = table.states()
+    states = table.states()
     table.add([_lease(2)])
-    table.remove(said)
+    table.remove(states)
     assert table.holds(_lease(2))
     assert not table.holds(_lease(1))
     table.remove(table.states())

@@ -21,20 +21,20 @@ from stickslip_workers.stages.run import run_tasks
 def test_files_are_those_of_zarr_python(
     make_dataset: Callable[..., Any], tmp_path: Path, views: bool
 ) -> None:
-    made = make_dataset(count=7, per_shard=4, rejected=(2,), views=views)
+    dataset = make_dataset(count=7, per_shard=4, rejected=(2,), views=views)
     packed = {
-        file.path: made.store.read(file.sha256)
-        for task in made.pack_tasks
-        for file in pack(task, made.store).files
+        file.path: dataset.store.read(file.sha256)
+        for task in dataset.pack_tasks
+        for file in pack(task, dataset.store).files
     }
     group = zarr.create_group(tmp_path / "zarr", zarr_format=3)
-    for array in layout(made.spec):
+    for array in layout(dataset.spec):
         if array.is_label:  # written by the task that publishes
             continue
         # A rejected sample has no chunk in the shard, but a chunk of curves is always there.
         with zarr.config.set({"array.write_empty_chunks": not array.per_sample}):
             target = create_array(group, array, sample_count=7, samples_per_file=4)
-            target[:] = made.arrays[array.name]  # type: ignore[index]
+            target[:] = dataset.arrays[array.name]  # type: ignore[index]
     written = {
         path.relative_to(tmp_path / "zarr").as_posix(): path.read_bytes()
         for path in (tmp_path / "zarr").rglob("*")
@@ -45,37 +45,37 @@ def test_files_are_those_of_zarr_python(
 
 
 def test_packing_again_gives_the_same_files(make_dataset: Callable[..., Any]) -> None:
-    made = make_dataset()
-    assert [pack(task, made.store) for task in made.pack_tasks] == [
-        pack(task, made.store) for task in made.pack_tasks
+    dataset = make_dataset()
+    assert [pack(task, dataset.store) for task in dataset.pack_tasks] == [
+        pack(task, dataset.store) for task in dataset.pack_tasks
     ]
 
 
 def test_a_rejected_slot_keeps_its_labels(make_dataset: Callable[..., Any]) -> None:
     """Labels of stages before the rejection are kept; only those of later stages are missing."""
-    made = make_dataset(count=4, per_shard=4, rejected=(2,))
-    (task,) = made.pack_tasks
+    dataset = make_dataset(count=4, per_shard=4, rejected=(2,))
+    (task,) = dataset.pack_tasks
     slots = list(task.slots)
     rejection = slots[2].rejection.model_copy(update={"labels": slots[2].labels | {"energy": 1.5}})
     slots[2] = slots[2].model_copy(update={"rejection": rejection})
-    output = pack(task.model_copy(update={"slots": tuple(slots)}), made.store)
-    arrays = [array for array in layout(made.spec) if array.is_label]
-    data = made.store.read(output.labels)
+    output = pack(task.model_copy(update={"slots": tuple(slots)}), dataset.store)
+    arrays = [array for array in layout(dataset.spec) if array.is_label]
+    data = dataset.store.read(output.labels)
     read = {}
     for array, (offset, length) in zip(arrays, decode_shard_index(data, len(arrays)), strict=True):
         read[array.name] = np.empty((4, *array.shape), array.dtype)
         decode_chunk(data[offset : offset + length], read[array.name])
     assert read["valid"].tolist() == [True, True, False, True]
     for name in ("gamma", "phi0", "phi1", "split", "sample_key"):
-        assert np.array_equal(read[name], made.arrays[name]), name
+        assert np.array_equal(read[name], dataset.arrays[name]), name
     assert read["gamma"][2] == task.slots[2].labels["gamma"]
     assert read["energy"][2] == 1.5
     assert np.isnan(read["color"][2]).all()
 
 
 def _with_first_slot(task: PackTask, **changes: Any) -> PackTask:
-    first, *others = task.slots
-    return task.model_copy(update={"slots": (first.model_copy(update=changes), *others)})
+    first, *further = task.slots
+    return task.model_copy(update={"slots": (first.model_copy(update=changes), *further)})
 
 
 def test_a_corrupt_chunk_is_refused(
@@ -145,9 +145,9 @@ def test_a_failed_task_names_all_its_damaged_inputs(
 def test_publishing_a_rotten_shard_names_it(
     make_dataset: Callable[..., Any], store: DirectoryStore
 ) -> None:
-    made = make_dataset()
-    task = made.publish_task
-    rotten = made.files[3].sha256
+    dataset = make_dataset()
+    task = dataset.publish_task
+    rotten = dataset.files[3].sha256
     path = store.path(rotten)
     data = bytearray(path.read_bytes())
     data[5] ^= 1
@@ -161,9 +161,9 @@ def test_publishing_a_rotten_shard_names_it(
 def test_publishing_with_lost_labels_or_lists_names_them(
     make_dataset: Callable[..., Any], store: DirectoryStore
 ) -> None:
-    made = make_dataset()
-    task = made.publish_task
-    labels = made.packed[1].labels
+    dataset = make_dataset()
+    task = dataset.publish_task
+    labels = dataset.packed[1].labels
     store.path(labels).unlink()
     (result,) = run_tasks([task], store)
     assert (result.outcome, result.damaged_inputs) == ("failed", (labels,))

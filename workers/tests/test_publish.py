@@ -45,13 +45,13 @@ def _assert_same(got: np.ndarray[Any, Any], expected: np.ndarray[Any, Any], name
     ],
 )
 def test_three_readers_give_back_what_went_in(make_dataset: Make, shape: dict[str, Any]) -> None:
-    made = make_dataset(**shape)
-    directory = made.publish()
+    packed = make_dataset(**shape)
+    directory = packed.publish()
     group = zarr.open_group(directory, mode="r")
-    assert group.attrs["spec_digest"] == made.spec.content_digest
+    assert group.attrs["spec_digest"] == packed.spec.content_digest
     with xarray.open_zarr(directory, chunks=None, mask_and_scale=False) as dataset:
-        assert set(dataset.variables) == set(made.arrays)
-        for name, expected in made.arrays.items():
+        assert set(dataset.variables) == set(packed.arrays)
+        for name, expected in packed.arrays.items():
             _assert_same(group[name][...], expected, name)
             _assert_same(dataset[name].values, expected, name)
             spec = {
@@ -67,10 +67,10 @@ def test_a_version_of_many_samples_has_sections(
     make_dataset: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The same version with and without sections: other lists, and the same files."""
-    made = make_dataset(count=7, per_shard=2, rejected=(2, 5))
-    whole = _tree(made.publish())
+    packed = make_dataset(count=7, per_shard=2, rejected=(2, 5))
+    whole = _tree(packed.publish())
     monkeypatch.setattr("stickslip_schemas.format.manifest.SECTION_SAMPLES", 5)
-    directory = made.publish()
+    directory = packed.publish()
     tree = _tree(directory)
     names = ["manifest/0.json", "manifest/1.json"]
     assert tree.keys() - whole.keys() == set(names)
@@ -83,15 +83,15 @@ def test_a_version_of_many_samples_has_sections(
     assert manifest.rejection_counts == {"out_of_frame": 2}
     contents = Contents(manifest, lambda file: tree[file.path])
     assert [(section.first, section.end) for section in contents.sections()] == [(0, 4), (4, 7)]
-    assert tuple(contents.sample_keys()) == made.sample_keys
-    assert tuple(contents.rejections()) == made.rejections
+    assert tuple(contents.sample_keys()) == packed.sample_keys
+    assert tuple(contents.rejections()) == packed.rejections
     listed = {file.path: (file.sha256, file.size) for file in contents.files()}
-    others = tree.keys() - {"manifest.json", "zarr.json", "manifest.sha256"}
-    assert listed == {path: (sha256(tree[path]), len(tree[path])) for path in others}
-    for path in others:
-        found = contents.file(path)
-        assert found is not None
-        assert found.sha256 == sha256(tree[path])
+    further = tree.keys() - {"manifest.json", "zarr.json", "manifest.sha256"}
+    assert listed == {path: (sha256(tree[path]), len(tree[path])) for path in further}
+    for path in further:
+        entry = contents.file(path)
+        assert entry is not None
+        assert entry.sha256 == sha256(tree[path])
     assert contents.file("views/c/4/0/0/0/0") is None
     assert not {path for path in listed if path.startswith("views/c")} & {
         file.path for file in manifest.files
@@ -100,19 +100,19 @@ def test_a_version_of_many_samples_has_sections(
 
 def test_labels_have_large_chunks(make_dataset: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("stickslip_schemas.spec.arrays.LABEL_SAMPLES", 3)
-    made = make_dataset(count=7, per_shard=2, rejected=(2,))
-    directory = made.publish()
+    packed = make_dataset(count=7, per_shard=2, rejected=(2,))
+    directory = packed.publish()
     assert sorted(path.name for path in (directory / "gamma/c").iterdir()) == ["0", "1", "2"]
     group = zarr.open_group(directory, mode="r")
     assert group["gamma"].chunks == (3,)
     assert group["centerline"].chunks[0] == 2
-    for name, expected in made.arrays.items():
+    for name, expected in packed.arrays.items():
         _assert_same(group[name][...], expected, name)
 
 
 def test_manifest_says_everything(make_dataset: Make) -> None:
-    made = make_dataset()
-    directory = made.publish()
+    packed = make_dataset()
+    directory = packed.publish()
     tree = _tree(directory)
     manifest = Manifest.model_validate_json(tree.pop("manifest.json"))
     digest = check_seal(
@@ -124,7 +124,7 @@ def test_manifest_says_everything(make_dataset: Make) -> None:
     assert {file.path: (file.sha256, file.size) for file in manifest.files} == {
         path: (sha256(data), len(data)) for path, data in tree.items()
     }
-    assert manifest.rejections == made.rejections
+    assert manifest.rejections == packed.rejections
     assert manifest.valid_count == 6
     assert sum(manifest.split_counts.values()) == 6
     assert [camera.name for camera in manifest.cameras]
@@ -135,8 +135,8 @@ def test_manifest_says_everything(make_dataset: Make) -> None:
 
 
 def test_what_is_not_rendered_has_no_picture(make_dataset: Make) -> None:
-    made = make_dataset(views=False)
-    directory = made.publish()
+    packed = make_dataset(views=False)
+    directory = packed.publish()
     assert not (directory / "preview.webp").exists()
     assert Manifest.model_validate_json((directory / "manifest.json").read_bytes()).pictures is None
 
@@ -144,9 +144,9 @@ def test_what_is_not_rendered_has_no_picture(make_dataset: Make) -> None:
 def test_publishing_again_and_after_a_crash_gives_the_same(
     make_dataset: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = make_dataset()
-    task = made.publish_task
-    directory = made.store.dataset_path(task.dataset, 1)
+    packed = make_dataset()
+    task = packed.publish_task
+    directory = packed.store.dataset_path(task.dataset, 1)
 
     class Killed(BaseException):
         """Not an Exception: nothing on the way may catch it, as nothing catches SIGKILL."""
@@ -154,60 +154,60 @@ def test_publishing_again_and_after_a_crash_gives_the_same(
     links = 0
     link = DirectoryStore.show
 
-    def dying_link(self: DirectoryStore, *shown: Any) -> None:
+    def dying_link(self: DirectoryStore, *arguments: Any) -> None:
         nonlocal links
         links += 1
         if links == 10:
             raise Killed
-        link(self, *shown)
+        link(self, *arguments)
 
     with monkeypatch.context() as patch:
         patch.setattr(DirectoryStore, "show", dying_link)
         with pytest.raises(Killed):
-            publish(task, made.store)
+            publish(task, packed.store)
     assert not (directory / "manifest.json").exists()
-    first = publish(task, made.store)
+    first = publish(task, packed.store)
     tree = _tree(directory)
-    assert publish(task, made.store) == first
+    assert publish(task, packed.store) == first
     assert _tree(directory) == tree
     assert first.bytes == sum(map(len, tree.values()))
     assert not [path for path in tree if path.endswith(".tmp")]
 
 
 def test_a_version_that_lacks_something_is_refused(make_dataset: Make) -> None:
-    made = make_dataset()
-    task = made.publish_task
+    packed = make_dataset()
+    task = packed.publish_task
     with pytest.raises(ValueError, match=r"files must be those of 2 shards.*'"):
-        publish(changed(task, made.store, files=tuple(made.files[1:])), made.store)
+        publish(changed(task, packed.store, files=tuple(packed.files[1:])), packed.store)
     with pytest.raises(ValueError, match="files must be those of 2 shards"):
-        publish(changed(task, made.store, labels=(made.packed[0].labels,)), made.store)
+        publish(changed(task, packed.store, labels=(packed.packed[0].labels,)), packed.store)
     with pytest.raises(ValueError, match="one path twice"):
-        publish(changed(task, made.store, files=(*made.files, made.files[0])), made.store)
+        publish(changed(task, packed.store, files=(*packed.files, packed.files[0])), packed.store)
     with pytest.raises(ValueError, match="rejections must be the slots that are not valid"):
-        publish(changed(task, made.store, rejections=()), made.store)
-    longer = made.files[0].model_copy(update={"size": made.files[0].size + 1})
+        publish(changed(task, packed.store, rejections=()), packed.store)
+    longer = packed.files[0].model_copy(update={"size": packed.files[0].size + 1})
     with pytest.raises(OSError, match=rf"must have {longer.size} bytes"):
-        publish(changed(task, made.store, files=(longer, *made.files[1:])), made.store)
+        publish(changed(task, packed.store, files=(longer, *packed.files[1:])), packed.store)
     with pytest.raises(
         ValueError, match=r"sections must have the samples 0 to 6, and they end at \[0, 6\]"
     ):
-        publish(changed(task, made.store, sample_keys=made.sample_keys[:6]), made.store)
+        publish(changed(task, packed.store, sample_keys=packed.sample_keys[:6]), packed.store)
     with pytest.raises(ValueError, match="dataset must be the id of its spec"):
-        publish(task.model_copy(update={"dataset": "../elsewhere"}), made.store)
-    made.store.path(made.files[0].sha256).write_bytes(b"cut")
+        publish(task.model_copy(update={"dataset": "../elsewhere"}), packed.store)
+    packed.store.path(packed.files[0].sha256).write_bytes(b"cut")
     with pytest.raises(OSError, match=r"must have .* bytes and the digest that names it"):
-        publish(task, made.store)
-    made.store.path(made.files[0].sha256).unlink()
+        publish(task, packed.store)
+    packed.store.path(packed.files[0].sha256).unlink()
     with pytest.raises(OSError, match="must have"):
-        publish(task, made.store)
-    assert not made.store.dataset_path(task.dataset, 1).exists()
+        publish(task, packed.store)
+    assert not packed.store.dataset_path(task.dataset, 1).exists()
 
 
 def test_a_version_has_a_card_that_is_true(
     make_dataset: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = make_dataset()
-    directory = made.publish()
+    packed = make_dataset()
+    directory = packed.publish()
     manifest = Manifest.model_validate_json((directory / "manifest.json").read_bytes())
     text = (directory / "README.md").read_text()
     assert sha256(text.encode()) in {

@@ -30,12 +30,12 @@ def test_the_command_prints_the_result(tmp_path: Path, capsys: pytest.CaptureFix
     assert DirectoryStore(tmp_path / "store").path(result.output.record.digest).exists()
 
 
-@pytest.mark.parametrize("what", [fake_renderer.FINE, fake_renderer.BUG])
+@pytest.mark.parametrize("behaviour", [fake_renderer.FINE, fake_renderer.BUG])
 def test_a_render_runs_in_the_other_interpreter(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, behaviour: int
 ) -> None:
     monkeypatch.setenv("PYTHONPATH", str(Path(fake_renderer.__file__).parent))
-    look = RodHangRender(rig="rod-4", rig_digest="0" * 64, quality="draft", color_seed=what)
+    look = RodHangRender(rig="rod-4", rig_digest="0" * 64, quality="draft", color_seed=behaviour)
     task = RenderTask(render=look, record=RecordRef(digest="0" * 64, row=0))
     result = replay(
         task,
@@ -43,7 +43,7 @@ def test_a_render_runs_in_the_other_interpreter(
         blender_python=Path(sys.executable),
         render_actor="fake_renderer:RenderActor",
     )
-    if what == fake_renderer.FINE:
+    if behaviour == fake_renderer.FINE:
         assert result.outcome == "succeeded"
     else:
         assert (result.reason, result.message) == (

@@ -104,15 +104,15 @@ def done(number: int) -> TaskResult:
 def clip(
     texture: str, *, preview: bool = False, record: RecordRef = RECORD, **look: object
 ) -> RenderTask:
-    shown = {
+    light_and_view = {
         "rig": "drag",
         "rig_digest": "0" * 64,
         "material": "gray-interlock",
         "texture": texture,
         "quality": "draft",
     }
-    shown |= {"viewpoint": "left", "instants": (0, 10), "light_seed": 1, "crease_seed": 2}
-    render = ClothDragRender.model_validate(shown | look)
+    light_and_view |= {"viewpoint": "left", "instants": (0, 10), "light_seed": 1, "crease_seed": 2}
+    render = ClothDragRender.model_validate(light_and_view | look)
     return RenderTask(render=render, record=record, preview=preview)
 
 
@@ -123,16 +123,16 @@ def chunk(number: int) -> ChunkRef:
 def test_only_the_texture_may_differ() -> None:
     same = shading_key(clip("dots"))
     assert shading_key(clip("plaid", preview=True)) == same
-    others = [
+    further = [
         clip("dots", light_seed=2),
         clip("dots", viewpoint="right"),
         clip("dots", creases=0.5),
     ]
-    others.append(clip("dots", ground_truth=("depth",)))
-    others.append(clip("dots", record=RecordRef(digest="d" * 64, row=1)))
-    assert same not in {shading_key(task) for task in others}
+    further.append(clip("dots", ground_truth=("depth",)))
+    further.append(clip("dots", record=RecordRef(digest="d" * 64, row=1)))
+    assert same not in {shading_key(task) for task in further}
     with pytest.raises(ValueError, match="renders of one shading"):
-        merge_renders([clip("dots"), others[0]])
+        merge_renders([clip("dots"), further[0]])
 
 
 def test_a_rod_shares_nothing() -> None:
@@ -149,7 +149,7 @@ def test_every_task_gets_its_own_clip_and_its_share_of_the_cost() -> None:
     asked = merge_renders(tasks)
     assert (asked.textures, asked.preview) == (("dots", "plaid", "floral"), True)
     depth = {"depth": chunk(9)}
-    made = [
+    outputs = [
         RenderOutput(
             chunks={"video": chunk(number), **depth},
             preview="e" * 64,
@@ -158,7 +158,10 @@ def test_every_task_gets_its_own_clip_and_its_share_of_the_cost() -> None:
         for number in range(2)
     ]
     poor = TaskResult(outcome="rejected", reason=Reason.poor_pictures, message="psnr_edge")
-    all_three = [*(TaskResult(outcome="succeeded", output=one) for one in made), poor]
+    all_three = [
+        *(TaskResult(outcome="succeeded", output=output_of_task) for output_of_task in outputs),
+        poor,
+    ]
     output = RenderOutput(
         chunks={}, labels={}, clips=dict(zip(asked.textures, all_three, strict=True))
     )
@@ -179,15 +182,15 @@ def test_every_task_gets_its_own_clip_and_its_share_of_the_cost() -> None:
 
 def test_textures_of_the_users_own_go_by_their_pictures() -> None:
     """Two jobs may give one name to two pictures, and one picture may have two names."""
-    one, other = (f"sha256:{digit * 64}" for digit in "12")
+    first, other = (f"sha256:{digit * 64}" for digit in "12")
     tasks = [
         clip("dots"),
-        clip("logo", image=one),
+        clip("logo", image=first),
         clip("logo", image=other),
-        clip("brand", image=one),
+        clip("brand", image=first),
     ]
     asked = merge_renders(tasks)
-    assert asked.textures == ("dots", one, other)
+    assert asked.textures == ("dots", first, other)
     output = RenderOutput(
         chunks={}, labels={}, clips={name: done(n) for n, name in enumerate(asked.textures)}
     )

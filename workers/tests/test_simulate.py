@@ -74,8 +74,8 @@ def test_a_rod_does_not_depend_on_its_batch(store: DirectoryStore) -> None:
     for task, result in zip(tasks, together, strict=True):
         (alone,) = run_tasks([task], store)
         assert alone.output.labels == result.output.labels
-        one, many = _curves(store, alone), _curves(store, result)
-        assert all(np.array_equal(one[name], many[name]) for name in one)
+        single, many = _curves(store, alone), _curves(store, result)
+        assert all(np.array_equal(single[name], many[name]) for name in single)
 
 
 def test_a_rod_without_a_stable_shape_is_rejected(

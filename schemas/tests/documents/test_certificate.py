@@ -110,9 +110,9 @@ CONTRADICTIONS: dict[str, tuple[dict[str, Any], str]] = {
 }
 
 
-@pytest.mark.parametrize("what", CONTRADICTIONS)
-def test_contradictions_are_refused(what: str) -> None:
-    wrong, words = CONTRADICTIONS[what]
+@pytest.mark.parametrize("contradiction", CONTRADICTIONS)
+def test_contradictions_are_refused(contradiction: str) -> None:
+    wrong, words = CONTRADICTIONS[contradiction]
     with pytest.raises(ValidationError, match=words):
         Certificate.model_validate(wrong)
 

@@ -76,7 +76,7 @@ def document(**change: Any) -> dict[str, Any]:
     return {"kind": "cloth_scene", "scene": scene, "frames": 5, "axes": axes, **change}
 
 
-def made(**change: Any) -> ClothSceneSpec:
+def spec_of(**change: Any) -> ClothSceneSpec:
     """Return such a spec, validated."""
     spec = job_spec_adapter.validate_python(document(**change))
     assert isinstance(spec, ClothSceneSpec)
@@ -85,20 +85,20 @@ def made(**change: Any) -> ClothSceneSpec:
 
 def points(**change: Any) -> list[KeyedPoint]:
     """Return the samples of such a spec."""
-    return list(keyed_points(made(**change), BUILDS))
+    return list(keyed_points(spec_of(**change), BUILDS))
 
 
 def test_documents_have_the_values_of_parameters_at_all_their_places() -> None:
-    spec = made(
+    spec = spec_of(
         axes={
             "fabric": ["gray-interlock", "camel-ponte-roma"],
             "late": {"type": "sobol", "low": 0.6, "high": 1, "num": 2},
         }
     )
-    found = list(keyed_points(spec, BUILDS))
-    assert len(found) == count(spec).sample_count == 16
-    assert len({point.simulation_key for point in found}) == count(spec).simulation_count == 8
-    for point in found:
+    points = list(keyed_points(spec, BUILDS))
+    assert len(points) == count(spec).sample_count == 16
+    assert len({point.simulation_key for point in points}) == count(spec).simulation_count == 8
+    for point in points:
         simulation = spec.simulation(point.labels)
         assert canonical_json(simulation.model_dump(mode="json")) == point.simulation_text
         render = spec.render(point.labels)
@@ -113,7 +113,7 @@ def test_documents_have_the_values_of_parameters_at_all_their_places() -> None:
 def test_a_parameter_without_an_axis_is_a_label_with_its_default() -> None:
     (first, *_) = points()
     assert (first.labels["fabric"], first.labels["late"]) == ("gray-interlock", 1.0)
-    names = [array.name for array in layout(made())]
+    names = [array.name for array in layout(spec_of())]
     assert {
         "mu",
         "fabric",
@@ -163,7 +163,7 @@ def test_what_is_simulated_is_in_the_key(change: dict[str, Any]) -> None:
 
 
 def test_tasks_name_the_files_that_they_read() -> None:
-    spec = made()
+    spec = spec_of()
     assert spec.artifacts == {
         "/scene/bodies/figure/file": "a" * 64,
         "/scene/looks/sheets/under/texture": "b" * 64,
@@ -234,17 +234,17 @@ def test_a_built_in_scene_is_named() -> None:
 def test_a_wrong_spec_is_refused(
     change: dict[str, Any], pointer: str, rule: str, value: str
 ) -> None:
-    given = document(**{key: value for key, value in change.items() if key != "scene"})
-    given |= {key: value for key, value in change.items() if key == "scene"}
+    spec = document(**{key: value for key, value in change.items() if key != "scene"})
+    spec |= {key: value for key, value in change.items() if key == "scene"}
     with pytest.raises(ValidationError) as caught:
-        job_spec_adapter.validate_python(given)
-    found = {error.pointer: error for error in field_errors(caught.value, given, AnyJobSpec)}
-    assert rule in found[pointer].rule
-    assert found[pointer].value == value or not pointer
+        job_spec_adapter.validate_python(spec)
+    errors = {error.pointer: error for error in field_errors(caught.value, spec, AnyJobSpec)}
+    assert rule in errors[pointer].rule
+    assert errors[pointer].value == value or not pointer
 
 
 def test_many_samples_are_planned_without_validating_each() -> None:
-    spec = made(axes={"mu": {"type": "random", "low": 0.1, "high": 1, "num": 5000}})
+    spec = spec_of(axes={"mu": {"type": "random", "low": 0.1, "high": 1, "num": 5000}})
     begin = time.process_time()
     assert sum(1 for _ in keyed_points(spec, BUILDS)) == 10_000
     assert time.process_time() - begin < 5.0  # validation of each document would take 10 s

@@ -107,7 +107,10 @@ def test_every_number_is_in_the_key_of_the_render_and_in_no_other(change: dict[s
     assert [sample.simulation_key for sample in before] == [
         sample.simulation_key for sample in after
     ]
-    changed = [one.render_key != other.render_key for one, other in zip(before, after, strict=True)]
+    changed = [
+        original.render_key != other.render_key
+        for original, other in zip(before, after, strict=True)
+    ]
     assert sum(changed) == len(changed) / 2  # those of one of two names
 
 
@@ -240,8 +243,10 @@ def test_rotations_of_rodrigues_are_those_of_opencv() -> None:
 
     for camera in load_rig("drag"):
         rvec = Rotation.from_matrix(np.asarray(camera.rotation)).as_rotvec().tolist()
-        own = Calibration(**LAB | {"rvec": rvec, "tvec": list(camera.translation)}).camera("lab")
-        np.testing.assert_allclose(own.rotation, camera.rotation, atol=1e-9)
+        decoded = Calibration(**LAB | {"rvec": rvec, "tvec": list(camera.translation)}).camera(
+            "lab"
+        )
+        np.testing.assert_allclose(decoded.rotation, camera.rotation, atol=1e-9)
 
 
 # --- pictures

@@ -188,11 +188,13 @@ def test_bad_specs_are_pointed_at(document: Any, pointer: str, rule: str, value:
 POINT = {"material": "royal-target", "mu": 0.1, "texture": "dots", "viewpoint": "left"}
 
 
-@pytest.mark.parametrize(("given", "meant"), [({}, SELF_FRICTION), ({"self_friction": None}, None)])
+@pytest.mark.parametrize(
+    ("fields", "meant"), [({}, SELF_FRICTION), ({"self_friction": None}, None)]
+)
 def test_dragged_cloth_has_self_contact_unless_its_spec_says_null(
-    given: dict[str, Any], meant: float | None
+    fields: dict[str, Any], meant: float | None
 ) -> None:
-    spec = job_spec_adapter.validate_python(CLOTH | given)
+    spec = job_spec_adapter.validate_python(CLOTH | fields)
     simulation = spec.simulation(POINT)
     assert isinstance(simulation, ClothDragSimulation)
     assert simulation.self_friction == meant

@@ -22,7 +22,7 @@ def pack_key(spec: JobSpec, shard: int, members: Sequence[KeyedPoint], builds: B
     return plan.pack_key(spec, shard, [(point.key, point.split) for point in members], builds)
 
 
-def one(
+def single_point(
     poisson: float = 0.5,
     seed: int = 0,
     builds: Builds = BUILDS,
@@ -45,7 +45,7 @@ def test_pinned_keys() -> None:
     """Keys of finished work: if one of these changes, every dataset in the world would be
     recomputed.
     """
-    sample = one()
+    sample = single_point()
     assert sample.simulation_key == PINNED["simulation"]
     assert sample.split == PINNED["split"]
     assert isinstance(sample.render, RodHangRender)
@@ -68,20 +68,22 @@ def test_pinned_keys() -> None:
 
 
 def test_simulation_depends_on_physics_and_sim_core_only() -> None:
-    key = one().simulation_key
-    assert one(poisson=0.3).simulation_key != key
-    assert one(builds=BUILDS.model_copy(update={"simulate": "d" * 64})).simulation_key != key
-    assert one(builds=BUILDS.model_copy(update={"render": "d" * 64})).simulation_key == key
-    assert one(seed=1, name="x", views=None, samples_per_shard=2).simulation_key == key
+    key = single_point().simulation_key
+    assert single_point(poisson=0.3).simulation_key != key
+    assert (
+        single_point(builds=BUILDS.model_copy(update={"simulate": "d" * 64})).simulation_key != key
+    )
+    assert single_point(builds=BUILDS.model_copy(update={"render": "d" * 64})).simulation_key == key
+    assert single_point(seed=1, name="x", views=None, samples_per_shard=2).simulation_key == key
 
 
 def test_render_depends_on_simulation_look_and_renderer() -> None:
-    key = one().render_key
-    assert one(poisson=0.3).render_key != key
-    assert one(seed=1).render_key != key
-    assert one(quality="draft").render_key != key
-    assert one(builds=BUILDS.model_copy(update={"render": "d" * 64})).render_key != key
-    assert one(name="x", samples_per_shard=2).render_key == key
+    key = single_point().render_key
+    assert single_point(poisson=0.3).render_key != key
+    assert single_point(seed=1).render_key != key
+    assert single_point(quality="draft").render_key != key
+    assert single_point(builds=BUILDS.model_copy(update={"render": "d" * 64})).render_key != key
+    assert single_point(name="x", samples_per_shard=2).render_key == key
 
 
 def test_a_name_is_no_content_and_a_build_makes_no_other_dataset() -> None:
@@ -125,12 +127,12 @@ def test_splits_by_clip_part_the_renders_of_a_simulation_and_change_no_other_key
     """
     spec = job_spec_adapter.validate_python(GRID)
     by_clip = job_spec_adapter.validate_python(GRID | {"splits": {"by": "clip"}})
-    found: dict[str, set[int]] = {}
+    splits_of_clip: dict[str, set[int]] = {}
     for plain, sample in zip(samples(spec, BUILDS), samples(by_clip, BUILDS), strict=True):
         assert sample.key == plain.key
         assert sample.split == split_of(by_clip, sample.labels)
-        found.setdefault(sample.simulation_key, set()).add(sample.split)
-    assert sum(len(splits) > 1 for splits in found.values()) > 10
+        splits_of_clip.setdefault(sample.simulation_key, set()).add(sample.split)
+    assert sum(len(splits) > 1 for splits in splits_of_clip.values()) > 10
 
 
 def test_renders_of_one_simulation_share_its_split() -> None:
@@ -213,11 +215,11 @@ def _rods(count: int = 5, **more: object) -> JobSpec:
 def test_shards_are_whole_and_have_their_keys() -> None:
     spec = _rods()
     points = tuple(keyed_points(spec, BUILDS))
-    found = list(shards(spec, BUILDS))
-    assert [shard.number for shard in found] == [0, 1, 2]
-    assert [shard.points for shard in found] == [points[:2], points[2:4], points[4:]]
-    assert [shard.pack_key for shard in found] == [
-        pack_key(spec, shard.number, shard.points, BUILDS) for shard in found
+    shards_of_job = list(shards(spec, BUILDS))
+    assert [shard.number for shard in shards_of_job] == [0, 1, 2]
+    assert [shard.points for shard in shards_of_job] == [points[:2], points[2:4], points[4:]]
+    assert [shard.pack_key for shard in shards_of_job] == [
+        pack_key(spec, shard.number, shard.points, BUILDS) for shard in shards_of_job
     ]
 
 
@@ -235,7 +237,7 @@ def test_a_pack_key_holds_what_a_shard_is_made_of() -> None:
     spec = _rods(2)
     first, second = keyed_points(spec, BUILDS)
     key = pack_key(spec, 0, [first, second], BUILDS)
-    others = {
+    other_keys = {
         "order": pack_key(spec, 0, [second, first], BUILDS),
         "number": pack_key(spec, 1, [first, second], BUILDS),
         "samples": pack_key(spec, 0, [first], BUILDS),
@@ -243,7 +245,7 @@ def test_a_pack_key_holds_what_a_shard_is_made_of() -> None:
         "build": pack_key(spec, 0, [first, second], BUILDS.model_copy(update={"pack": "d" * 64})),
         "samples_per_shard": pack_key(_rods(2, samples_per_shard=3), 0, [first, second], BUILDS),
     }
-    assert len({key, *others.values()}) == 1 + len(others), others
+    assert len({key, *other_keys.values()}) == 1 + len(other_keys), other_keys
     assert key == pack_key(
         spec, 0, [first, second], BUILDS.model_copy(update={"sim_core": "d" * 64})
     )
@@ -255,16 +257,16 @@ def test_a_pack_key_holds_the_codes_of_labels() -> None:
         "materials": {"mine": {"density": 0.2, "young": 1e6, "poisson": 0.3, "thickness": 5e-4}},
         "axes": {"material": "royal-target", "mu": 0.3, "texture": "dots", "viewpoint": "left"},
     }
-    (one,) = shards(job_spec_adapter.validate_python(document), BUILDS)
+    (single_point,) = shards(job_spec_adapter.validate_python(document), BUILDS)
     (two,) = shards(job_spec_adapter.validate_python(document | {"materials": {}}), BUILDS)
-    assert one.points == two.points
-    assert one.pack_key != two.pack_key
+    assert single_point.points == two.points
+    assert single_point.pack_key != two.pack_key
 
 
 def test_a_publish_key_holds_what_a_version_is_made_of() -> None:
     spec = _rods(2)
     key = publish_key(spec, ["a", "b"], BUILDS)
-    others = {
+    other_keys = {
         "order": publish_key(spec, ["b", "a"], BUILDS),
         "shards": publish_key(spec, ["a"], BUILDS),
         "spec": publish_key(_rods(2, seed=1), ["a", "b"], BUILDS),
@@ -275,7 +277,7 @@ def test_a_publish_key_holds_what_a_version_is_made_of() -> None:
             for stage in ("sim_core", "simulate", "render", "pack")
         },
     }
-    assert len({key, *others.values()}) == 1 + len(others), others
+    assert len({key, *other_keys.values()}) == 1 + len(other_keys), other_keys
     assert key == publish_key(_rods(2, name="x"), ["a", "b"], BUILDS)
 
 
@@ -294,7 +296,7 @@ def test_points_are_the_samples_of_the_models() -> None:
     """The fast way over texts and the plain way over models give the same keys, for every kind and
     optional axis.
     """
-    own = {"density": 0.2, "young": 1e6, "poisson": 0.3, "thickness": 5e-4}
+    custom = {"density": 0.2, "young": 1e6, "poisson": 0.3, "thickness": 5e-4}
     cloth = {"material": ["mine", "royal-target"], "mu": [0.3, 1.0], "texture": ["dots", "plaid"]}
     looks = {"texture": ["dots", "plaid"], "viewpoint": "high"}
     documents = [
@@ -302,7 +304,7 @@ def test_points_are_the_samples_of_the_models() -> None:
         GRID | {"splits": {"by": "clip"}},
         {
             "kind": "cloth_drag",
-            "materials": {"mine": own},
+            "materials": {"mine": custom},
             "axes": cloth
             | {"viewpoint": "left", "bending": [0.5, 2.0], "substrate": ["matt", "ceramic"]},
         },
@@ -314,7 +316,7 @@ def test_points_are_the_samples_of_the_models() -> None:
         {
             "kind": "cloth_scene",
             "scene": "on-cloth",
-            "set": {"materials": {"mine": own}},
+            "set": {"materials": {"mine": custom}},
             "axes": looks | {"mu": 0.3, "stretched_fabric": ["mine", "camel-ponte-roma"]},
         },
         {

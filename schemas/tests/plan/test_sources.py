@@ -35,7 +35,7 @@ def run():
 
 
 @pytest.fixture
-def made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def tree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for name, text in PACKAGE.items():
         path = tmp_path / "stickslip_made" / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -44,7 +44,7 @@ def made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "stickslip_made"
 
 
-def test_imports_are_followed_wherever_they_stand(made: Path) -> None:
+def test_imports_are_followed_wherever_they_stand(tree: Path) -> None:
     assert set(sources(["stickslip_made.work"])) == {
         "stickslip_made/work.py",
         "stickslip_made/table.toml",  # named in a string
@@ -56,7 +56,7 @@ def test_imports_are_followed_wherever_they_stand(made: Path) -> None:
     assert "stickslip_made" not in sys.modules  # nothing is run
 
 
-def test_every_change_changes_the_digests_and_no_other(made: Path) -> None:
+def test_every_change_changes_the_digests_and_no_other(tree: Path) -> None:
     before = digests(sources(["stickslip_made.work"]))
     for name, path in sources(["stickslip_made.work"]).items():
         text = path.read_text()
@@ -65,11 +65,11 @@ def test_every_change_changes_the_digests_and_no_other(made: Path) -> None:
         assert {key for key in before if before[key] != after[key]} == {name}
         path.write_text(text)
     for name in ("typed.py", "other.py", "not_named.toml"):
-        (made / name).write_text("# changed\n")
+        (tree / name).write_text("# changed\n")
     assert digests(sources(["stickslip_made.work"])) == before
 
 
-def test_what_is_cut_is_not_followed(made: Path) -> None:
+def test_what_is_cut_is_not_followed(tree: Path) -> None:
     assert "stickslip_made/other.py" in sources(["stickslip_made.asks"])
     assert set(sources(["stickslip_made.asks"], cut=("stickslip_made.registry",))) == {
         "stickslip_made/asks.py"
@@ -82,6 +82,6 @@ def test_what_is_cut_is_not_followed(made: Path) -> None:
     }
 
 
-def test_a_module_that_is_missing_is_named(made: Path) -> None:
+def test_a_module_that_is_missing_is_named(tree: Path) -> None:
     with pytest.raises(ModuleNotFoundError, match=r"no source of module stickslip_made\.gone"):
         sources(["stickslip_made.lost"])

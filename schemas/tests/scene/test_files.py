@@ -223,18 +223,18 @@ def scene(file: str) -> Scene:
 
 def test_files_become_references_with_their_counts(tmp_path: Path) -> None:
     (tmp_path / "towel.obj").write_bytes(FLAT)
-    made, found = inlined(scene("towel.obj"), lambda name: (tmp_path / name).read_bytes())
-    assert found == {sha256(FLAT): FLAT}
-    assert made.sheets["towel"].mesh.shape == (3, 1)
-    ((place, name),) = made.files()
+    whole, files = inlined(scene("towel.obj"), lambda name: (tmp_path / name).read_bytes())
+    assert files == {sha256(FLAT): FLAT}
+    assert whole.sheets["towel"].mesh.shape == (3, 1)
+    ((place, name),) = whole.files()
     assert name == f"sha256:{sha256(FLAT)}"
-    check_scene_file(made, place, FLAT)
-    assert with_arrays(made, found.__getitem__)["sheets"]["towel"]["mesh"]["file"][
+    check_scene_file(whole, place, FLAT)
+    assert with_arrays(whole, files.__getitem__)["sheets"]["towel"]["mesh"]["file"][
         "rest"
     ].shape == (3, 2)
     more = FLAT.replace(b"f 1", b"v 1 1 1\nvt 0.1 0.1\nf 2/2 4/4 3/3\nf 1")
     with pytest.raises(UnfitFileError, match=r"counts must be .* \[4, 2\], and are \[3, 1\]"):
-        check_scene_file(made, place, more)
+        check_scene_file(whole, place, more)
     with pytest.raises(
         UnfitFileError,
         match=r"sheets.towel.mesh.file: must have faces, and has none, nor .*, in towel.obj",
@@ -244,12 +244,12 @@ def test_files_become_references_with_their_counts(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", scene_names())
 def test_built_in_scenes_are_whole(name: str) -> None:
-    made = load_scene(name)
-    assert made.name == name
-    assert made.description
-    assert made.parameters
-    for place, file in made.files():
-        check_scene_file(made, place, built_in_files()[file.removeprefix("sha256:")])
+    loaded = load_scene(name)
+    assert loaded.name == name
+    assert loaded.description
+    assert loaded.parameters
+    for place, file in loaded.files():
+        check_scene_file(loaded, place, built_in_files()[file.removeprefix("sha256:")])
 
 
 def test_the_files_of_a_scene_are_limited_together(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -397,8 +397,8 @@ def test_tables_are_what_lines_are(corner: str, extra: str) -> None:
         unusual = text.replace(b"vn 0 0 1", b"vn 0 0 1 # up")
         assert read_tables(unusual, with_pattern=True, farthest=FARTHEST) is None
         plain, by_lines = read_polygons(text), read_polygons(unusual)
-        for one, other in zip(plain, by_lines, strict=True):
-            np.testing.assert_array_equal(one, other)
+        for table, other in zip(plain, by_lines, strict=True):
+            np.testing.assert_array_equal(table, other)
 
 
 @pytest.mark.parametrize(

@@ -78,9 +78,9 @@ def pattern(shift: float = 0.0) -> tuple[Any, Any]:
 
 
 def islands() -> bytes:
-    one, triangles = pattern()
+    island, triangles = pattern()
     other, _ = pattern(shift=0.2)
-    flat = np.vstack([one, other])
+    flat = np.vstack([island, other])
     return obj(
         np.column_stack([flat, np.zeros(len(flat))]),
         [*triangles, *[tuple(c + 4 for c in corners) for corners in triangles]],
@@ -160,8 +160,8 @@ FILES = {
 }
 
 
-def keys(*moves: tuple[float, list[float]], **others: Any) -> dict[str, Any]:
-    return {"keys": [{"time": time, "move": move} for time, move in moves], **others}
+def keys(*moves: tuple[float, list[float]], **further_keys: Any) -> dict[str, Any]:
+    return {"keys": [{"time": time, "move": move} for time, move in moves], **further_keys}
 
 
 def faults_of(changes: dict[tuple[str, ...], Any]) -> list[StartFault]:
@@ -677,18 +677,18 @@ def test_every_pair_of_random_triangles_is_compared() -> None:
     """The trees leave out no crossing: the same answer as all pairs give."""
     rng = np.random.default_rng(5)
     for _ in range(5):
-        one = TriangleMesh(rng.uniform(0, 1, (60, 3)), np.arange(60).reshape(-1, 3))
+        soup = TriangleMesh(rng.uniform(0, 1, (60, 3)), np.arange(60).reshape(-1, 3))
         other = TriangleMesh(rng.uniform(0.9, 1.6, (60, 3)), np.arange(60).reshape(-1, 3))
         single = [
             find_crossing(
-                TriangleMesh(one.vertices, one.triangles[i : i + 1]),
+                TriangleMesh(soup.vertices, soup.triangles[i : i + 1]),
                 TriangleMesh(other.vertices, other.triangles[j : j + 1]),
                 Workload(10_000),
             )
             for i in range(20)
             for j in range(20)
         ]
-        assert (find_crossing(one, other, Workload(10_000)) is None) == all(
+        assert (find_crossing(soup, other, Workload(10_000)) is None) == all(
             item is None for item in single
         )
 

@@ -378,9 +378,9 @@ def test_every_number_has_a_unit_but_those_that_are_pure() -> None:
     pure = {
         name: {
             field
-            for field, said in model.get("properties", {}).items()
-            if '"number"' in json.dumps(said)
-            and not re.search(r"\[.+\]", said.get("description", ""))
+            for field, description in model.get("properties", {}).items()
+            if '"number"' in json.dumps(description)
+            and not re.search(r"\[.+\]", description.get("description", ""))
         }
         for name, model in models.items()
     }
@@ -391,18 +391,20 @@ def test_every_number_has_a_unit_but_those_that_are_pure() -> None:
     "row", WRONG, ids=lambda row: f"{row[0]}={'missing' if row[1] is GONE else row[1]}"[:60]
 )
 def test_a_wrong_scene_is_refused(row: tuple[Any, ...]) -> None:
-    place, value, said, rule, *shown = row
+    place, value, pointer, rule, *values = row
     document = changed(place, value)
     with pytest.raises(ValidationError) as caught:
         Scene.model_validate(document)
     errors = field_errors(caught.value, document, Scene)
-    found = {error.pointer: error for error in errors}.get("/" + (said or place).replace(".", "/"))
-    assert found, errors
-    assert rule in found.rule
+    error_there = {error.pointer: error for error in errors}.get(
+        "/" + (pointer or place).replace(".", "/")
+    )
+    assert error_there, errors
+    assert rule in error_there.rule
     if "required" not in rule:
-        shown = shown or [json.dumps(at(document, said or place))]
+        values = values or [json.dumps(at(document, pointer or place))]
     assert (
-        found.value == (shown[0] if len(shown[0]) <= 200 else f"{shown[0][:197]}...")
-        if shown
-        else not found.value
+        error_there.value == (values[0] if len(values[0]) <= 200 else f"{values[0][:197]}...")
+        if values
+        else not error_there.value
     )

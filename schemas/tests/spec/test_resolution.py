@@ -102,10 +102,10 @@ def test_the_default_is_left_out_of_documents_and_keys() -> None:
     """So a spec that says nothing and one that says the default are one dataset."""
     for document in (DRAG, ROD, SCENE):
         default = _spec(document)
-        said = _spec(document, resolution=[224, 224])
-        assert said.content_digest == default.content_digest
+        explicit = _spec(document, resolution=[224, 224])
+        assert explicit.content_digest == default.content_digest
         assert "resolution" not in default.model_dump(mode="json")
-        renders = [next(keyed_points(spec, BUILDS)).render_text for spec in (default, said)]
+        renders = [next(keyed_points(spec, BUILDS)).render_text for spec in (default, explicit)]
         assert renders[0] == renders[1]
         assert "resolution" not in str(renders[0])
         larger = _spec(document, resolution=[640, 480])
@@ -223,8 +223,8 @@ def test_a_camera_of_a_scene_may_have_its_size() -> None:
 
 def test_a_camera_of_a_scene_without_a_size_keeps_the_digest_of_its_spec() -> None:
     plain = _spec(_with_cameras())
-    said = _spec(_with_cameras(resolution=None))
-    assert plain.content_digest == said.content_digest
+    explicit = _spec(_with_cameras(resolution=None))
+    assert plain.content_digest == explicit.content_digest
     assert "resolution" not in str(plain.model_dump(mode="json"))
 
 

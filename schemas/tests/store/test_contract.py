@@ -200,12 +200,12 @@ def test_a_damaged_artifact_is_noticed_and_written_anew(place: Place, wrong: byt
 
 
 def test_a_deleted_artifact_is_gone(store: Store) -> None:
-    kept, deleted = store.publish(b"kept"), store.publish(b"deleted")
+    remaining, deleted = store.publish(b"kept"), store.publish(b"deleted")
     for _ in range(2):
         store.delete(deleted)
         assert not store.exists(deleted)
-    assert [file.name for file in store.stored()] == [kept]
-    assert store.read(kept) == b"kept"
+    assert [file.name for file in store.stored()] == [remaining]
+    assert store.read(remaining) == b"kept"
 
 
 def test_all_artifacts_are_listed(store: Store) -> None:
@@ -229,11 +229,11 @@ def test_a_version_shows_artifacts_until_it_is_hidden(store: Store) -> None:
     assert store.shows(shard, "ds-1", 1, "views/c/0")
     assert not store.shows(other, "ds-1", 1, "views/c/0")
     assert not store.shows(shard, "ds-1", 1, "views/c/1")
-    assert [(found.dataset, found.version) for found in store.versions("views/c/0")] == [
+    assert [(version.dataset, version.version) for version in store.versions("views/c/0")] == [
         ("ds-1", 1),
         ("ds-1", 12),
     ]
-    assert [(found.dataset, found.version) for found in store.versions("manifest.json")] == [
+    assert [(version.dataset, version.version) for version in store.versions("manifest.json")] == [
         ("ds-2", 1)
     ]
     assert sorted(file.name for file in store.stored()) == sorted([shard, other])
@@ -311,9 +311,9 @@ def test_a_plain_zarr_reader_opens_a_version(place: Place) -> None:
     group.create_array("views", data=values, chunks=(1, 6), shards=(2, 6))
     for path, data in memory._store_dict.items():
         place.store.show(place.store.publish(data.to_bytes()), "ds-1", 1, path)
-    found = zarr.open_group(place.zarr("datasets/ds-1/v1"), mode="r")["views"]
-    assert isinstance(found, zarr.Array)
-    assert np.array_equal(found[:], values)
+    views = zarr.open_group(place.zarr("datasets/ds-1/v1"), mode="r")["views"]
+    assert isinstance(views, zarr.Array)
+    assert np.array_equal(views[:], values)
 
 
 def test_stores_are_opened_by_path_and_by_url(tmp_path: Path) -> None:

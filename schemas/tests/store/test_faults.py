@@ -51,7 +51,7 @@ def store(proxy: Proxy, request: pytest.FixtureRequest) -> BucketStore:
 def test_a_bucket_without_a_request_for_many_deletes_one_by_one(
     proxy: Proxy, store: BucketStore
 ) -> None:
-    kept, gone = store.publish(SMALL), store.publish(LARGE)
+    remaining, gone = store.publish(SMALL), store.publish(LARGE)
     store.show(gone, "dataset", 1, "a")
     store.show(gone, "dataset", 1, "b")
     proxy.fault = lambda method, path: "501" if method == "POST" and "delete" in path else ""
@@ -59,7 +59,7 @@ def test_a_bucket_without_a_request_for_many_deletes_one_by_one(
     store.hide("dataset", 1)
     assert proxy.counts["501"] > 0
     assert not store.is_shown("dataset", 1)
-    assert [found.name for found in store.stored()] == [kept]
+    assert [artifact.name for artifact in store.stored()] == [remaining]
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -70,16 +70,18 @@ def test_every_request_may_fail_once(proxy: Proxy, store: BucketStore, fault: st
             lambda data: store.read(sha256(data)),
             lambda data: store.size(sha256(data)),
         ):
-            seen: set[tuple[str, str]] = set()
+            failed_once: set[tuple[str, str]] = set()
 
-            def once(method: str, path: str, seen: set[tuple[str, str]] = seen) -> str:
-                is_first = (method, path) not in seen
-                seen.add((method, path))
+            def once(
+                method: str, path: str, failed_once: set[tuple[str, str]] = failed_once
+            ) -> str:
+                is_first = (method, path) not in failed_once
+                failed_once.add((method, path))
                 return fault if is_first else ""
 
             proxy.fault = once
             step(data)
-            assert seen
+            assert failed_once
         proxy.fault = no_fault
         assert store.read(sha256(data)) == data
     assert proxy.counts[fault] >= 4
@@ -165,7 +167,7 @@ def test_much_goes_wrong_at_once_and_nothing_is_lost(proxy: Proxy, store: Bucket
         list(writers.map(lambda k: store.show(digests[k], "ds-1", 1, f"c/{k}"), range(50)))
     happened = Counter({fault: proxy.counts[fault] for fault in FAULTS})
     proxy.fault = no_fault
-    assert sorted(found.name for found in store.stored()) == sorted(set(digests))
+    assert sorted(artifact.name for artifact in store.stored()) == sorted(set(digests))
     assert all(store.shows(digests[k], "ds-1", 1, f"c/{k}") for k in range(50))
     assert happened.total() >= 20
     assert all(happened[fault] > 0 for fault in FAULTS)

@@ -26,9 +26,9 @@ constexpr int window = 4;
 // Halvings of a correction along its line. Sweep: GMRES takes 18 % more with 2 and 4 % less with 8
 // in a fold, and 15 % more with 5 in a pile.
 constexpr int cuts_max = 4;
-// Length of the first smoothing over h, and of each smoothing over the one before. Sweep: 0.05 and
-// 0.2 take 21 and 20 % more in a crumple.
-constexpr double smoothing_ratio = 0.1;
+// Length of the first smoothing over h, and of each smoothing over the one before: each is much
+// sharper. Sweep: 0.05 and 0.2 take 21 and 20 % more in a crumple.
+constexpr double smoothing_ratio = 1.0 / much;
 // Residual, over the mean force of smoothing, from which the law becomes sharper. Sweep: 2.5 and 10
 // take 9 and 19 % more in a crumple.
 constexpr double smoothed_residual = 5.0;
@@ -43,10 +43,10 @@ constexpr int smoothed_hops = static_cast<int>(1.0 / path::skin);
 // method with the exact one takes its place. Sweep: 0.125 and 0.5 take 6 % more and 3 % less in a
 // crumple.
 constexpr double slow = pairs::converging * pairs::converging;
-// Decrease of the squares of forces, a hundredth of the forces, from which an attempt goes on
-// beyond its iterations, with the exact matrix. Sweep: half and twice take 3 and 14 % less in a
-// crumple.
-constexpr double close = 1e-4;
+// Decrease of the squares of forces from which an attempt goes on beyond its iterations, with the
+// exact matrix: two orders of magnitude of the forces. Sweep: half and twice take 3 and 14 % less
+// in a crumple.
+constexpr double close = 1.0 / (much * much * much * much);
 // Share to which all nodes are shortened together before single ones are stopped, which strains the
 // cloth. Sweep: 0.05 and 0.2 take 20 and 8 % more in a crumple.
 constexpr double common_min = 0.1;

@@ -87,7 +87,7 @@ PairPast::PairPast(const Pair& pair)
       cone(pair.cone) {}
 
 PairMotions Pair::motions(const Buffer<float>& change, int free_nodes) const {
-  PairMotions out = given;
+  PairMotions out = held_motions;
   for (int c = 0; c < 4; ++c) {
     if (stencil.node[c] >= free_nodes) continue;
     const Vector3d displacement = at_node(change, stencil.node[c]).cast<double>();
@@ -108,7 +108,7 @@ Eigen::Matrix<double, 9, 9> Pair::stiffness() const {
 }
 
 Vector3d Pair::motion(const Buffer<float>& change, int free_nodes) const {
-  Vector3d out = given.head<3>();
+  Vector3d out = held_motions.head<3>();
   for (int c = 0; c < 4; ++c) {
     if (stencil.node[c] < free_nodes)
       out += weights[c] * at_node(change, stencil.node[c]).cast<double>();
@@ -275,7 +275,7 @@ PairData ContactSet::rows() {
 
 void ContactSet::subtract_right_side(Buffer<float>& force) const {
   for (const Pair& pair : pairs_) {
-    PairMotions change = -pair.stiffness() * pair.given;
+    PairMotions change = -pair.stiffness() * pair.held_motions;
     change.head<3>() += pair.row.force;
     if (change.isZero(0.0)) continue;
     for (int c = 0; c < 4; ++c) {

@@ -23,8 +23,7 @@ using PairMotions = Eigen::Matrix<double, 9, 1>;
 // One pair of closest points: its geometry, its force, and its part of Newton's system.
 struct Pair {
   Candidate stencil;
-  int feature;  // closest to a vertex: a triangle, an edge (counted after the triangles) or a node
-                // (after the edges); or the second edge
+  int feature;  // closest to a vertex, by `FeatureNumbers` (detection.cpp); or the second edge
   Eigen::Vector4d weights;
   Contact contact;
   ProximalStiffness proximal;
@@ -34,7 +33,7 @@ struct Pair {
   // Derivatives of the weights by the places of the closest points on their pieces.
   Eigen::Vector4d along_first, along_second;
   // Part of its motions that held nodes still have to make, m.
-  PairMotions given = PairMotions::Zero();
+  PairMotions held_motions = PairMotions::Zero();
   // Derivatives by the motions: of the places of the closest points, and of the force as the normal
   // turns.
   Eigen::Matrix<double, 2, 9> sliding = Eigen::Matrix<double, 2, 9>::Zero();
@@ -159,6 +158,16 @@ class ContactSet {
   int feature_of(const Candidate& stencil, const Eigen::Vector4d& weights) const;
   int triangles_around(int feature) const;
   bool has_reverse(int vertex, int feature) const;
+  // Of a pair, m/N: with the mean stiffness of its nodes, and with that along the normal.
+  struct Compliance {
+    double mean, along_normal;
+  };
+  Compliance compliance(const Candidate& stencil, const Eigen::Vector4d& weights,
+                        const Eigen::Vector3d& normal) const;
+  ProximalStiffness proximal_stiffness(const Compliance& compliance) const;
+  PairMotions held_motions(const Candidate& stencil, const Eigen::Vector4d& weights,
+                           const Eigen::Vector4d& along_first, const Eigen::Vector4d& along_second,
+                           const Buffer<double>& x) const;
   void add(const Candidate& stencil, int feature, const Eigen::Vector4d& weights,
            const Buffer<double>& x);
   Eigen::Vector3d slip(const Candidate& stencil, const Eigen::Vector4d& weights,

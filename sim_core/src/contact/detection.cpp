@@ -1,3 +1,11 @@
+// Which pieces of cloth make a pair at the positions of an iterate, and the pair of each.
+//
+// 1. `CandidateSet::pairs` (path.cpp) lists the candidates with a lower bound of their distance.
+// 2. `find_vertices` and `find_edges` measure those that may be within reach. Points that several
+//    candidates have in common make one pair: a vertex over the edge of two triangles is near both.
+// 3. `add` makes a pair: its gap, normal and slip, and its stiffnesses.
+//
+// The forces come afterwards, from the pairs of the iterate before (matching.cpp).
 #include <Eigen/Geometry>
 #include <algorithm>
 #include <cmath>
@@ -19,14 +27,19 @@ using Eigen::Vector4d;
 constexpr double end_weight = 1e-3;
 
 // Derivatives of the weights by the places of the closest points: along both edges, or along the
-// sides of the feature of a triangle.
-std::pair<Vector4d, Vector4d> directions(PairKind kind, const Vector4d& weights) {
+// sides of the feature of a triangle. Those of a feature with fewer sides are zero.
+struct WeightDirections {
   Vector4d first = Vector4d::Zero(), second = Vector4d::Zero();
+};
+
+WeightDirections directions(PairKind kind, const Vector4d& weights) {
+  WeightDirections along;
   if (kind == PairKind::edge_edge) {
-    first << -1.0, 1.0, 0.0, 0.0;
-    second << 0.0, 0.0, 1.0, -1.0;
-    return {first, second};
+    along.first << -1.0, 1.0, 0.0, 0.0;
+    along.second << 0.0, 0.0, 1.0, -1.0;
+    return along;
   }
+  // Corners of the feature have a weight. A side leads from each further one to the first.
   int base = -1;
   for (int c = 1; c < 4; ++c) {
     if (weights[c] == 0.0) continue;
@@ -34,12 +47,31 @@ std::pair<Vector4d, Vector4d> directions(PairKind kind, const Vector4d& weights)
       base = c;
       continue;
     }
-    Vector4d& along = first.isZero(0.0) ? first : second;
-    along[base] = 1.0;
-    along[c] = -1.0;
+    Vector4d& side = along.first.isZero(0.0) ? along.first : along.second;
+    side[base] = 1.0;
+    side[c] = -1.0;
   }
-  return {first, second};
+  return along;
 }
+
+// Numbers of the features to which a vertex may be closest: the triangles of a surface, then its
+// edges, then its nodes.
+class FeatureNumbers {
+ public:
+  explicit FeatureNumbers(const Surface& surface)
+      : edges_from_(static_cast<int>(surface.triangles.size())),
+        nodes_from_(edges_from_ + static_cast<int>(surface.edges.size())) {}
+
+  int of_edge(int edge) const { return edges_from_ + edge; }
+  int of_node(int node) const { return nodes_from_ + node; }
+  bool is_triangle(int feature) const { return feature < edges_from_; }
+  bool is_node(int feature) const { return feature >= nodes_from_; }
+  int edge(int feature) const { return feature - edges_from_; }
+  int node(int feature) const { return feature - nodes_from_; }
+
+ private:
+  int edges_from_, nodes_from_;
+};
 
 }  // namespace
 
@@ -72,43 +104,46 @@ void ContactSet::find(const Buffer<double>& x) {
   find_edges(candidates, range, x);
 }
 
-// Which feature of a triangle is the closest to a vertex: see Pair.
+// The feature of a triangle that is the closest to a vertex. Its corners have a weight: three of a
+// triangle, two of an edge, one of a node.
 int ContactSet::feature_of(const Candidate& stencil, const Vector4d& weights) const {
   const Surface& surface = near.surface;
-  const int triangles = static_cast<int>(surface.triangles.size());
-  int corner = 0, opposite = 0;
+  const FeatureNumbers numbers(surface);
+  int corner = 0, opposite = 0;  // the last with a weight, and the last without
   for (int i = 0; i < 3; ++i) (weights[1 + i] != 0.0 ? corner : opposite) = i;
   const auto corners = (weights.tail<3>().array() != 0.0).count();
   if (corners == 3) return stencil.second;
-  if (corners == 2) return triangles + surface.triangle_edges[stencil.second][opposite];
-  return triangles + static_cast<int>(surface.edges.size()) + stencil.node[1 + corner];
+  if (corners == 2) return numbers.of_edge(surface.triangle_edges[stencil.second][opposite]);
+  return numbers.of_node(stencil.node[1 + corner]);
 }
 
+// How many triangles have a feature in common.
 int ContactSet::triangles_around(int feature) const {
   const Surface& surface = near.surface;
-  const int triangles = static_cast<int>(surface.triangles.size());
-  const int edges = static_cast<int>(surface.edges.size());
-  if (feature < triangles) return 1;
-  if (feature < triangles + edges) return surface.triangles_of_edge[feature - triangles];
-  const int node = feature - triangles - edges;
+  const FeatureNumbers numbers(surface);
+  if (numbers.is_triangle(feature)) return 1;
+  if (!numbers.is_node(feature)) return surface.triangles_of_edge[numbers.edge(feature)];
+  const int node = numbers.node(feature);
   return surface.around_begin[node + 1] - surface.around_begin[node];
 }
 
-// Two corners that are each other's closest are one pair.
+// Whether the pair of a vertex and a node is in the list already, as that of the node and the
+// vertex: two nodes that are each other's closest make one pair.
 bool ContactSet::has_reverse(int vertex, int feature) const {
-  const int nodes_from =
-      static_cast<int>(near.surface.triangles.size() + near.surface.edges.size());
-  if (feature < nodes_from) return false;
-  const int other = feature - nodes_from;
-  const auto first =
-      std::lower_bound(pairs_.begin(), pairs_.end(), other,
-                       [](const Pair& pair, int stencil) { return pair.stencil.first < stencil; });
-  return std::any_of(first, pairs_.end(), [&](const Pair& pair) {
-    return pair.stencil.first == other && pair.feature == nodes_from + vertex;
+  const FeatureNumbers numbers(near.surface);
+  if (!numbers.is_node(feature)) return false;
+  const int node = numbers.node(feature);
+  // Pairs of vertices are sorted by the vertex.
+  const auto first_of_node =
+      std::lower_bound(pairs_.begin(), pairs_.end(), node,
+                       [](const Pair& pair, int first) { return pair.stencil.first < first; });
+  return std::any_of(first_of_node, pairs_.end(), [&](const Pair& pair) {
+    return pair.stencil.first == node && pair.feature == numbers.of_node(vertex);
   });
 }
 
-// `range`: beyond what approached in the step, m. The candidates of a vertex follow each other.
+// `range`: distance up to which pieces make a pair, beside what they keep apart and what they may
+// have approached in the step, m. The candidates of a vertex follow each other.
 void ContactSet::find_vertices(std::vector<Candidate>& candidates, double range,
                                const Buffer<double>& x) {
   std::size_t begin = 0;
@@ -128,6 +163,7 @@ void ContactSet::find_vertices(std::vector<Candidate>& candidates, double range,
 
 // A vertex may be closest to an edge or corner of a triangle. Such a pair counts once, and only
 // where all triangles around the feature agree: else a point inside one of them is closer.
+// `NearFeature` tells which feature each triangle names.
 void ContactSet::find_vertex(std::span<Candidate> candidates, double reach,
                              const Buffer<double>& x) {
   std::vector<NearFeature>& near_features = near_features_;
@@ -143,16 +179,19 @@ void ContactSet::find_vertex(std::span<Candidate> candidates, double reach,
             [](const NearFeature& a, const NearFeature& b) {
               return a.feature != b.feature ? a.feature < b.feature : a.candidate < b.candidate;
             });
+  // Triangles that name the same feature follow each other now.
   for (std::size_t i = 0, next = 0; i < near_features.size(); i = next) {
     const int feature = near_features[i].feature;
     while (next < near_features.size() && near_features[next].feature == feature) ++next;
     const Candidate& stencil = *near_features[i].candidate;
-    const bool agree = static_cast<int>(next - i) == triangles_around(feature);
-    if (!agree || stencil.distance > reach || has_reverse(stencil.first, feature)) continue;
+    const bool do_all_agree = static_cast<int>(next - i) == triangles_around(feature);
+    if (!do_all_agree || stencil.distance > reach || has_reverse(stencil.first, feature)) continue;
     add(stencil, feature, near_features[i].weights, x);
   }
 }
 
+// Two edges make a pair where they cross. Their ends belong to vertices, and parallel edges have no
+// unique closest points.
 void ContactSet::find_edges(std::vector<Candidate>& candidates, double range,
                             const Buffer<double>& x) {
   for (Candidate& stencil : candidates) {
@@ -161,68 +200,98 @@ void ContactSet::find_edges(std::vector<Candidate>& candidates, double range,
     const FourPoints at = points_of(stencil, x);
     const Vector4d weights = closest_weights(stencil.kind, at);
     stencil.distance = between_closest(weights, at).norm();
-    if (stencil.distance > reach || weights.cwiseAbs().minCoeff() < end_weight ||
-        crossing_squared(at) < pairs::crossing_min)
+    const bool is_at_an_end = weights.cwiseAbs().minCoeff() < end_weight;
+    if (stencil.distance > reach || is_at_an_end || crossing_squared(at) < pairs::crossing_min)
       continue;
     add(stencil, stencil.second, weights, x);
   }
 }
 
-// With the compliances 1/k_i of the pair's nodes, in the mean or along n, the pair's own is sum
-// w_i^2/k_i: its stiffness scales with the inverse of that.
+// Compliances of the free nodes of a pair: with the stiffness K_i of a node, in the mean or along
+// n, that of the pair is sum w_i^2/K_i. Both are 0 where all nodes are held.
+ContactSet::Compliance ContactSet::compliance(const Candidate& stencil, const Vector4d& weights,
+                                              const Vector3d& normal) const {
+  const double mean_fraction = stiff ? 1.0 : stiffness::mean_fraction;
+  Compliance sum{0.0, 0.0};
+  for (int c = 0; c < 4; ++c) {
+    if (stencil.node[c] >= free_nodes_) continue;
+    const Matrix3d& node_stiffness = own_[stencil.node[c]];
+    const double mean = node_stiffness.trace() / 3.0;
+    const double along_normal =
+        mean_fraction * mean + std::max(normal.dot(node_stiffness * normal), 0.0);
+    sum.mean += weights[c] * weights[c] / mean;
+    sum.along_normal += weights[c] * weights[c] / along_normal;
+  }
+  return sum;
+}
+
+// The proximal stiffness of a pair. The smoothed law regularizes redundant pairs by itself.
+ProximalStiffness ContactSet::proximal_stiffness(const Compliance& compliance) const {
+  if (smoothing > 0.0) {
+    const double smoothed = stiffness::smoothed_proximal / compliance.mean;
+    return {.normal = smoothed, .tangential = smoothed};
+  }
+  return {.normal = stiffness::proximal / compliance.along_normal,
+          .tangential = stiffness::proximal / compliance.mean};
+}
+
+// The part of a pair's motions that its held nodes still have to make: from x to their ends.
+PairMotions ContactSet::held_motions(const Candidate& stencil, const Vector4d& weights,
+                                     const Vector4d& along_first, const Vector4d& along_second,
+                                     const Buffer<double>& x) const {
+  PairMotions motions = PairMotions::Zero();
+  for (int c = 0; c < 4; ++c) {
+    const int node = stencil.node[c];
+    if (node < free_nodes_) continue;
+    const Vector3d displacement = at_node(*ends_, node) - at_node(x, node);
+    motions.segment<3>(0) += weights[c] * displacement;
+    motions.segment<3>(3) += along_first[c] * displacement;
+    motions.segment<3>(6) += along_second[c] * displacement;
+  }
+  return motions;
+}
+
+// Adds the pair of a candidate, without a force.
 void ContactSet::add(const Candidate& stencil, int feature, const Vector4d& weights,
                      const Buffer<double>& x) {
   const FourPoints at = points_of(stencil, x);
   const Vector3d rho = between_closest(weights, at);
   const double distance = rho.norm();
-  const int a = near.surface.sheet_of_node[stencil.node[0]],
-            b = near.surface.sheet_of_node[stencil.node[3]];
   least_distance_ = std::min(least_distance_, distance);
+  // Points that coincide have no normal.
   if (!(distance > 0.0)) return;
-  const auto [along_first, along_second] = directions(stencil.kind, weights);
-  PairMotions given = PairMotions::Zero();
-  for (int c = 0; c < 4; ++c) {
-    const int node = stencil.node[c];
-    if (node < free_nodes_) continue;
-    const Vector3d displacement = at_node(*ends_, node) - at_node(x, node);
-    given.segment<3>(0) += weights[c] * displacement;
-    given.segment<3>(3) += along_first[c] * displacement;
-    given.segment<3>(6) += along_second[c] * displacement;
-  }
   const Vector3d n = rho / distance;
-  const double mean_fraction = stiff ? 1.0 : stiffness::mean_fraction;
-  double softness = 0.0, softness_along = 0.0;  // m/N: in the mean, and along the normal
-  for (int c = 0; c < 4; ++c) {
-    if (stencil.node[c] >= free_nodes_) continue;
-    const Matrix3d& own = own_[stencil.node[c]];
-    const double mean = own.trace() / 3.0;
-    softness += weights[c] * weights[c] / mean;
-    softness_along +=
-        weights[c] * weights[c] / (mean_fraction * mean + std::max(n.dot(own * n), 0.0));
-  }
-  if (!(softness > 0.0)) return;
+  const Compliance softness = compliance(stencil, weights, n);
+  // Held nodes move as they must, whatever force acts on them.
+  if (!(softness.mean > 0.0)) return;
+
+  const int first_sheet = near.surface.sheet_of_node[stencil.node[0]];
+  const int second_sheet = near.surface.sheet_of_node[stencil.node[3]];
+  const double thickness = materials.rest_distance(stencil.kind, first_sheet, second_sheet);
   Vector3d slip = this->slip(stencil, weights, rho);
   slip -= slip.dot(n) * n;
-  const double thickness = materials.rest_distance(stencil.kind, a, b),
-               k = stiffness::law / softness;
-  const double along = smoothing > 0.0 ? stiffness::smoothed_proximal / softness
-                                       : stiffness::proximal / softness_along;
-  const double across =
-      (smoothing > 0.0 ? stiffness::smoothed_proximal : stiffness::proximal) / softness;
-  const Vector3d first = stencil.kind == PairKind::vertex_triangle
-                             ? at[0]
-                             : Vector3d(weights[0] * at[0] + weights[1] * at[1]);
-  pairs_.push_back({stencil,
-                    feature,
-                    weights,
-                    {distance - thickness, n, slip, Vector3d::Zero(), materials.mu(a, b), k},
-                    {along, across},
-                    k * smoothing * smoothing,
-                    first - 0.5 * rho,
-                    thickness,
-                    along_first,
-                    along_second,
-                    given});
+  const double k = stiffness::law / softness.mean;
+  const Contact contact{.gap = distance - thickness,
+                        .normal = n,
+                        .slip = slip,
+                        .force = Vector3d::Zero(),
+                        .mu = materials.mu(first_sheet, second_sheet),
+                        .stiffness = k};
+  const Vector3d first_point = stencil.kind == PairKind::vertex_triangle
+                                   ? at[0]
+                                   : Vector3d(weights[0] * at[0] + weights[1] * at[1]);
+  const auto [along_first, along_second] = directions(stencil.kind, weights);
+  pairs_.push_back({.stencil = stencil,
+                    .feature = feature,
+                    .weights = weights,
+                    .contact = contact,
+                    .proximal = proximal_stiffness(softness),
+                    .smoothing_energy = k * smoothing * smoothing,
+                    .middle = first_point - 0.5 * rho,
+                    .thickness = thickness,
+                    .along_first = along_first,
+                    .along_second = along_second,
+                    .held_motions = held_motions(stencil, weights, along_first, along_second, x)});
 }
 
 // Motion of the first point over the second, less that by which rho turns.
@@ -230,13 +299,18 @@ Vector3d ContactSet::slip(const Candidate& stencil, const Vector4d& weights, con
   return rho - turn_of(stencil, weights) * between_closest(weights, points_of(stencil, *start_));
 }
 
+// The turn of a pair's nodes by their weights: half of it from each of two sheets, and all of it
+// from a surface, which sheets do not turn.
 Matrix3d ContactSet::turn_of(const Candidate& stencil, const Vector4d& weights) {
   const std::vector<int>& sheet_of_node = near.surface.sheet_of_node;
-  const int a = sheet_of_node[stencil.node[0]], b = sheet_of_node[stencil.node[3]];
+  const int first_sheet = sheet_of_node[stencil.node[0]];
+  const int second_sheet = sheet_of_node[stencil.node[3]];
+  const auto is_surface = [&](int sheet) { return sheet >= materials.sheets; };
   Matrix3d turn = Matrix3d::Zero();
   for (int c = 0; c < 4; ++c) {
-    const int own = sheet_of_node[stencil.node[c]], other = stencil.on_first(c) ? b : a;
-    const double fraction = own >= materials.sheets ? 1.0 : other >= materials.sheets ? 0.0 : 0.5;
+    const int sheet = sheet_of_node[stencil.node[c]];
+    const int opposite_sheet = stencil.on_first(c) ? second_sheet : first_sheet;
+    const double fraction = is_surface(sheet) ? 1.0 : is_surface(opposite_sheet) ? 0.0 : 0.5;
     if (fraction * weights[c] != 0.0)
       turn += fraction * std::abs(weights[c]) * turns_.of(near.surface, stencil.node[c]);
   }

@@ -38,8 +38,8 @@ def gradients(cloth: Cloth) -> Floats:
     before, after = (
         np.moveaxis(x[triangles[:, 1:]] - x[triangles[:, :1]], 1, 2) for x in (rest, at)
     )
-    found: Floats = after @ np.linalg.inv(before)
-    return found
+    gradient: Floats = after @ np.linalg.inv(before)
+    return gradient
 
 
 def moved(height: float, by: ArrayLike, bodies: list[Body], held: ArrayLike = HELD) -> Cloth:

@@ -56,14 +56,14 @@ def test_distance_is_that_of_the_oracle(edges: bool) -> None:
 def test_weights_are_stationary(edges: bool) -> None:
     """The derivative of the distance is n times the weights."""
     rng = np.random.default_rng(2)
-    seen = 0
-    while seen < 100:
+    count = 0
+    while count < 100:
         x = rng.normal(size=(4, 3))
         w = core.closest_weights(edges, x)
         rho = w @ x
         if np.linalg.norm(rho) < 0.1:
             continue
-        seen += 1
+        count += 1
         gradient = np.zeros((4, 3))
         for i, c in np.ndindex(4, 3):
             step = np.zeros((4, 3))
@@ -170,9 +170,9 @@ def test_candidates_are_those_of_brute_force(
     apart: dict[tuple[int, ...], float], reach: float
 ) -> None:
     x, triangles = crumpled(5)
-    found = [tuple(pair) for pair in core.contact_candidates(triangles, x, reach)]
-    assert len(found) > 10
-    assert found == [pair for pair, gap in apart.items() if gap <= reach]
+    listed = [tuple(pair) for pair in core.contact_candidates(triangles, x, reach)]
+    assert len(listed) > 10
+    assert listed == [pair for pair, gap in apart.items() if gap <= reach]
 
 
 def test_candidates_of_a_flat_sheet_are_none() -> None:

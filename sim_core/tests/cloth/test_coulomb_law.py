@@ -27,10 +27,10 @@ def law(
     proximal: tuple[float, float] = (KAPPA, LAMBDA),
     smoothing: float = 0.0,
 ) -> tuple[int, Floats, Floats, Floats, float]:
-    found: tuple[int, Floats, Floats, Floats, float] = core.pair_row(
+    mode, stiffness, symmetric, change, error, _ = core.pair_row(
         gap, n, slip, force, mu, K, *proximal, smoothing
     )
-    return found
+    return mode, stiffness, symmetric, change, error
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -43,10 +43,10 @@ def test_roots(seed: int) -> None:
         (SLIP, 0.0, -0.3 * t, 2.0 * n + 1.0 * t),
     ]
     for mode, gap, slip, force in roots:
-        found = law(gap, n, slip, force, 0.5)
-        assert found[0] == mode
-        assert found[3] == pytest.approx(zero, abs=1e-12)  # nothing to correct
-        assert found[4] == pytest.approx(0.0, abs=1e-24)
+        branch, _, _, correction, error = law(gap, n, slip, force, 0.5)
+        assert branch == mode
+        assert correction == pytest.approx(zero, abs=1e-12)
+        assert error == pytest.approx(0.0, abs=1e-24)
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.3, np.pi / 4, 1.0, np.pi / 2, 2.5])
@@ -183,9 +183,9 @@ def test_smoothed_roots(epsilon: float) -> None:
     for friction in (0.0, 0.3, 0.99):
         force = pressing * n + friction * t
         slip = -2.0 * epsilon * friction / (mu**2 * pressing**2 - friction**2) * t
-        found = law(epsilon / pressing, n, slip, force, mu, smoothing=epsilon)
-        assert found[4] == pytest.approx(0.0, abs=1e-24)
-        assert found[3] == pytest.approx(np.zeros(3), abs=1e-9)
+        _, _, _, correction, error = law(epsilon / pressing, n, slip, force, mu, smoothing=epsilon)
+        assert error == pytest.approx(0.0, abs=1e-24)
+        assert correction == pytest.approx(np.zeros(3), abs=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -319,7 +319,7 @@ def test_nodes_and_pairs_obey_one_law(seed: int) -> None:
     mode, t, node_force, correction, coupling, turning = core.node_row(
         gap, n, slip, force, mu, K, 1e12
     )
-    row_mode, stiffness, _, pair_force, _ = core.pair_row(gap, n, slip, force, mu, K, stiff, stiff)
+    row_mode, stiffness, _, pair_force, _ = law(gap, n, slip, force, mu, (stiff, stiff))
     assert mode == row_mode == SLIP
     assert coupling == mu
     assert correction == pytest.approx(-gap * n)
@@ -351,3 +351,91 @@ def test_what_sinks_in_while_it_pulls_rubs_by_its_new_normal_force(pull: float) 
     _, _, node_force, _, coupling, _ = core.node_row(gap, n, -0.6 * t, force, mu, K, 1e12)
     assert coupling == mu
     assert node_force @ t == pytest.approx(mu * pull - 0.8)
+
+
+# ---- Pairs: the normal that turns, and the motion that closes ------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_friction_of_a_pair_turns_with_its_normal(seed: int) -> None:
+    """The change of the force by the turn of the normal keeps the law, by finite differences.
+
+    At contact and without a slip, so that the law is a matter of the force and the normal alone.
+    The proximal stiffness is large, so that its term is left out.
+    """
+    mu = 0.5
+    n, t, s = frame(seed)
+    force = 2.0 * n + 1.2 * t + 0.9 * s
+    stiff = 1e12
+    mode, _, _, _, _, turning = core.pair_row(0.0, n, np.zeros(3), force, mu, K, stiff, stiff)
+    assert mode == SLIP
+
+    def missed(normal: Floats, r: Floats) -> Floats:
+        friction = r - (r @ normal) * normal
+        return np.asarray(friction - mu * (r @ normal) * friction / np.linalg.norm(friction))
+
+    rng = np.random.default_rng(seed)
+    turn = 0.3 * rng.normal() * t + 0.3 * rng.normal() * s  # of the normal
+    change = turning @ turn
+    step = 1e-6
+    plus, minus = (missed(n + e * turn, force + e * change) for e in (step, -step))
+    derivative = (plus - minus) / (2.0 * step)
+    assert np.linalg.norm(change) > 0.1, "friction turns"
+    assert [derivative @ t, derivative @ s] == pytest.approx([0.0, 0.0], abs=1e-7)
+
+
+def test_a_pair_that_sticks_holds_its_force_while_its_normal_turns() -> None:
+    n, t, _ = frame(1)
+    stuck = core.pair_row(0.0, n, np.zeros(3), 2.0 * n + 0.4 * t, 0.5, K, 1e12, 1e12)
+    assert stuck[0] == STICK
+    assert stuck[5] == pytest.approx(np.zeros((3, 3)))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_matrix_of_a_pair_moves_force_and_weights(seed: int) -> None:
+    """The force on a node is w_c r. Motions change r, and they slide the closest points, so w_c."""
+    rng = np.random.default_rng(seed)
+    weights, displacements = rng.normal(size=(4, 3)), 0.1 * rng.normal(size=(4, 3))
+    displacements = displacements.astype(np.float32).astype(float)
+    force, row_force, row_stiffness = (
+        rng.normal(size=3),
+        rng.normal(size=3),
+        rng.normal(size=(3, 3)),
+    )
+    sliding, turning = rng.normal(size=(2, 9)), rng.normal(size=(3, 9))
+    motions, change, stiffness = core.pair_changes(
+        weights, force, row_force, row_stiffness, sliding, turning, displacements
+    )
+    assert motions == pytest.approx((weights.T @ displacements).ravel())
+    assert change == pytest.approx(row_force - row_stiffness @ motions[:3] + turning @ motions)
+
+    slides = sliding @ motions
+    of_weights = weights[:, 1:] @ slides
+    expected = np.outer(weights[:, 0], change) + np.outer(of_weights, force)
+    right_side = np.concatenate([row_force, np.zeros(6)]) - stiffness @ motions
+    assert weights @ right_side.reshape(3, 3) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("gap", "approach", "slip", "mode"),
+    [
+        (0.1, 0.3, 0.09, STICK),  # sinks in by 0.2: up to 0.1 it sticks
+        (0.1, 0.3, 0.11, SLIP),
+        (0.1, 0.05, 0.001, SLIP),  # does not arrive, so it bears nothing
+        (-0.1, 0.1, 0.09, STICK),  # is in by 0.1 already
+        (-0.1, 0.1, 0.11, SLIP),
+        (-0.1, -0.3, 0.001, SLIP),  # leaves
+    ],
+)
+def test_a_motion_that_closes_a_pair_sticks_as_far_as_it_sinks_in(
+    gap: float, approach: float, slip: float, mode: int
+) -> None:
+    n, t, s = frame(3)
+    before = 0.5 * slip * t
+    motion = -approach * n + 0.5 * slip * t
+    branch, direction = core.closing(gap, n, before, np.zeros(3), 0.5, K, motion)
+    assert branch == mode
+    if mode == SLIP:
+        assert direction == pytest.approx(-t), "friction is against the slip at the end"
+    assert core.closing(gap, n, before, np.zeros(3), 0.0, K, motion)[0] == SLIP
+    assert abs(float(direction @ s)) < 1.0

@@ -28,19 +28,21 @@ def test_fabric_is_stable(name: str) -> None:
     """Its energies are positive: a quadratic form in (G00, G11) at every strain of the table, and
     in the curvature.
     """
-    one = fabric(name)
-    assert one.name == name
-    assert 0.05 < one.density < 1.0
-    assert one.stretching.shape == (6, 4)
-    k0, k1, k2, k3 = one.stretching.T
+    cloth_fabric = fabric(name)
+    assert cloth_fabric.name == name
+    assert 0.05 < cloth_fabric.density < 1.0
+    assert cloth_fabric.stretching.shape == (6, 4)
+    k0, k1, k2, k3 = cloth_fabric.stretching.T
     assert (k0 > 0.0).all()
     assert (k2 > 0.0).all()
     assert (k3 >= 0.0).all()
     assert (k0 * k2 > k1**2).all()
-    assert np.linalg.eigvalsh(one.rigidity)[0] > 0.0
-    bending_length = (np.diag(one.rigidity)[:2].mean() / (one.density * 9.81)) ** (1.0 / 3.0)
+    assert np.linalg.eigvalsh(cloth_fabric.rigidity)[0] > 0.0
+    bending_length = (
+        np.diag(cloth_fabric.rigidity)[:2].mean() / (cloth_fabric.density * 9.81)
+    ) ** (1.0 / 3.0)
     assert 0.003 < bending_length < 0.05
-    assert fabric(name) is one
+    assert fabric(name) is cloth_fabric
 
 
 def test_isotropic() -> None:
@@ -104,22 +106,22 @@ class TestOwnFabric:
     TABLE = np.tile([100.0, 10.0, 80.0, 20.0], (6, 1))
 
     def test_table(self) -> None:
-        own = custom_fabric(
+        custom = custom_fabric(
             "own", 0.2, stretching=self.TABLE, bending=(2e-5, 1e-5, 5e-6), damping=0.1
         )
-        assert (own.stretching == self.TABLE).all()
-        assert (own.rigidity == np.diag([2e-5, 1e-5, 5e-6])).all()
-        assert own.damping == 0.1
+        assert (custom.stretching == self.TABLE).all()
+        assert (custom.rigidity == np.diag([2e-5, 1e-5, 5e-6])).all()
+        assert custom.damping == 0.1
         assert (
-            custom_fabric("own", 0.2, stretching=self.TABLE, bending=own.rigidity).rigidity
-            == own.rigidity
+            custom_fabric("own", 0.2, stretching=self.TABLE, bending=custom.rigidity).rigidity
+            == custom.rigidity
         ).all()
 
     def test_young(self) -> None:
         """A plate of E, nu, h: Y = E h and D = E h^3 / (12 (1 - nu^2))."""
-        own = custom_fabric("own", 0.2, young=1e6, poisson=0.3, thickness=4e-4)
-        assert own.stretching[0, 0] == pytest.approx(1e6 * 4e-4 / (1.0 - 0.09))
-        assert own.rigidity[0, 0] == pytest.approx(1e6 * 4e-4**3 / 12.0 / (1.0 - 0.09))
+        custom = custom_fabric("own", 0.2, young=1e6, poisson=0.3, thickness=4e-4)
+        assert custom.stretching[0, 0] == pytest.approx(1e6 * 4e-4 / (1.0 - 0.09))
+        assert custom.rigidity[0, 0] == pytest.approx(1e6 * 4e-4**3 / 12.0 / (1.0 - 0.09))
         softer = custom_fabric(
             "own", 0.2, young=1e6, poisson=0.3, thickness=4e-4, bending=(1e-6, 1e-6, 4e-7)
         )
@@ -137,11 +139,11 @@ class TestOwnFabric:
     def test_scene_takes_it(self) -> None:
         """The same numbers give the same motion, whether by name or not."""
         named = cloth_drag.scene("gray-interlock", 0.5, mesh=7, frames=4).run()
-        own = cloth_drag.scene(fabric("gray-interlock").scaled(), 0.5, mesh=7, frames=4).run()
+        run = cloth_drag.scene(fabric("gray-interlock").scaled(), 0.5, mesh=7, frames=4).run()
         heavy = cloth_drag.scene(
             fabric("gray-interlock").scaled(density=2.0), 0.5, mesh=7, frames=4
         ).run()
-        assert own.positions.tobytes() == named.positions.tobytes()
+        assert run.positions.tobytes() == named.positions.tobytes()
         assert heavy.record["holder_force"][0, 2] == pytest.approx(
             2.0 * named.record["holder_force"][0, 2]
         )

@@ -59,8 +59,8 @@ def strip(
     return checks.Seen(cloth, cloth.positions[None], 0, None, [*names, "sheets.cloth"])
 
 
-def friction_error(seen: checks.Seen) -> float:
-    return checks.values(seen)["friction_error"]
+def friction_error(state: checks.Seen) -> float:
+    return checks.values(state)["friction_error"]
 
 
 @pytest.mark.physics
@@ -69,18 +69,18 @@ class TestEdges:
     @pytest.mark.parametrize("cells", [1.0, 2.0])
     def test_a_round_box_passes(self, cells: float, mu: float) -> None:
         table = box(mu, (0.4, 0.1, 0.2), rounding=cells * CELL, origin=(-0.2, 0.0, -0.1))
-        seen = strip(bodies=[table], height=2e-4)
-        assert 0.0 < friction_error(seen) < 0.5 * LIMIT
+        state = strip(bodies=[table], height=2e-4)
+        assert 0.0 < friction_error(state) < 0.5 * LIMIT
 
     def test_the_skin_of_a_mesh_of_a_cell_passes(self) -> None:
-        seen = strip(bodies=[], surfaces=(block(1.0, 0.4),), height=CELL + 2e-4)
-        assert 0.0 < friction_error(seen) < 0.5 * LIMIT
+        state = strip(bodies=[], surfaces=(block(1.0, 0.4),), height=CELL + 2e-4)
+        assert 0.0 < friction_error(state) < 0.5 * LIMIT
 
     def test_a_sharp_mesh_fails_and_the_reason_says_what_to_change(self) -> None:
         """On a crease of a quarter of a cell, friction of mu 0.2 is 19 % off."""
-        seen = strip(bodies=[], surfaces=(block(0.25, 0.2),), height=0.25 * CELL + 2e-4)
-        assert friction_error(seen) > 1.5 * LIMIT
-        code, reason = checks.failed(checks.values(seen), seen)
+        state = strip(bodies=[], surfaces=(block(0.25, 0.2),), height=0.25 * CELL + 2e-4)
+        assert friction_error(state) > 1.5 * LIMIT
+        code, reason = checks.failed(checks.values(state), state)
         assert code == "friction_error"
         assert reason.endswith(
             "bodies.block is too sharp for the cells of the cloth: give it edges with a radius of "

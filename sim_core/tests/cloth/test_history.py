@@ -40,8 +40,8 @@ def values(cloth: Cloth) -> dict[str, float]:
 def test_the_worst_stretch(
     part: list[float], whole: list[float], most: float, ratio: float
 ) -> None:
-    found = worst_stretch(np.array(part), np.array(whole), most)
-    assert found == pytest.approx(ratio, nan_ok=True)
+    stretch = worst_stretch(np.array(part), np.array(whole), most)
+    assert stretch == pytest.approx(ratio, nan_ok=True)
 
 
 def test_what_follows_mends_nothing_and_a_calm_end_adds_nothing() -> None:
@@ -53,12 +53,12 @@ def test_what_follows_mends_nothing_and_a_calm_end_adds_nothing() -> None:
             rng.random(steps) * (rng.random(steps) < 0.3),
             10.0 ** rng.uniform(-3, 1, steps),
         )
-        found = worst_stretch(part, whole, 0.5)
+        stretch = worst_stretch(part, whole, 0.5)
         tail = 10.0 ** rng.uniform(-3, 1, 30)
         worse = worst_stretch(np.append(part, rng.random(30)), np.append(whole, tail), 0.5)
         calm = worst_stretch(np.append(part, np.zeros(30)), np.append(whole, tail), 0.5)
-        assert worse >= found
-        assert calm == found
+        assert worse >= stretch
+        assert calm == stretch
 
 
 def sheet(preset: SolverSettings, height: float, held: ArrayLike) -> tuple[Cloth, Floats]:
@@ -73,15 +73,15 @@ def sheet(preset: SolverSettings, height: float, held: ArrayLike) -> tuple[Cloth
 def test_a_calm_end_does_not_hide_steps_that_did_not_converge() -> None:
     """A preset with one iteration cannot solve the steps on a floor that jolts, and solves rest."""
     preset = SolverSettings("hasty", 0.02, newton_max=1, halvings_max=0, step_error=None)
-    seen = []
+    shares = []
     for tail in TAILS:
         cloth, _ = sheet(preset, 0.0, ())
         for step in range(10 + tail):
             height = 0.01 * (1.0 - math.cos(2.0 * min(step, 10)))
             cloth.step(0.02, bodies=[plane(0.5, origin=(0.0, 0.0, height))])
-        seen.append((values(cloth)["unconverged"], cloth.total.unconverged))
-    assert seen[0][0] > 1.0
-    assert all(found == seen[0] for found in seen)
+        shares.append((values(cloth)["unconverged"], cloth.total.unconverged))
+    assert shares[0][0] > 1.0
+    assert all(share == shares[0] for share in shares)
 
 
 @pytest.mark.physics
@@ -90,7 +90,7 @@ def test_a_calm_end_does_not_hide_what_a_body_pushed_out() -> None:
     carries the cloth up and down afterwards moves much energy, and takes none of it back.
     """
     held = np.arange(35)
-    seen = []
+    depths = []
     for tail in TAILS:
         cloth, start = sheet(preset_named("certified"), 5e-4, held)
         cloth.step(0.01, held=start[held] - [0.0, 0.0, 1.5e-3], bodies=[plane(0.5)])
@@ -98,9 +98,9 @@ def test_a_calm_end_does_not_hide_what_a_body_pushed_out() -> None:
         for step in range(10 + tail):
             height = 0.01 * (1.0 - math.cos(0.05 * max(step - 10, 0)))
             cloth.step(0.02, bodies=[plane(0.5, origin=(0.0, 0.0, height))])
-        seen.append(values(cloth)["contact_gain"])
-    assert seen[0] > 1e-3
-    assert seen == pytest.approx([seen[0]] * len(TAILS), rel=1e-9)
+        depths.append(values(cloth)["contact_gain"])
+    assert depths[0] > 1e-3
+    assert depths == pytest.approx([depths[0]] * len(TAILS), rel=1e-9)
 
 
 @pytest.mark.physics
@@ -132,8 +132,8 @@ def give_history(cloth: Cloth, monkeypatch: pytest.MonkeyPatch, **columns: Array
     monkeypatch.setattr(cloth.history, "column", lambda name: np.asarray(columns[name]))
 
 
-def value_of(name: str, seen: checks.Seen) -> float:
-    return next(check for check in checks.CHECKS if check.name == name).value(seen)
+def value_of(name: str, state: checks.Seen) -> float:
+    return next(check for check in checks.CHECKS if check.name == name).value(state)
 
 
 @pytest.mark.parametrize(("end", "largest"), [(None, 9e-4), (2e-5, 1e-4)])
@@ -142,8 +142,8 @@ def test_motion_after_the_last_frame_is_no_jump(
 ) -> None:
     cloth, start = sheet(preset_named("certified"), 0.01, ())
     give_history(cloth, monkeypatch, motion_error=[1e-4, 9e-4])
-    seen = checks.Seen(cloth, start[None], 0, motion_error_end=end)
-    assert value_of("jumps", seen) == pytest.approx(largest / STEP_ERROR)
+    state = checks.Seen(cloth, start[None], 0, motion_error_end=end)
+    assert value_of("jumps", state) == pytest.approx(largest / STEP_ERROR)
 
 
 def test_work_is_judged_against_what_lifts_the_cloth_by_cells(

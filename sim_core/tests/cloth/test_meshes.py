@@ -80,8 +80,8 @@ def test_unstructured_is_delaunay() -> None:
     for triangle in mesh.triangles:
         a, b, c = mesh.rest[triangle]
         centre = np.linalg.solve(2.0 * np.stack([b - a, c - a]), [b @ b - a @ a, c @ c - a @ a])
-        others = np.delete(np.arange(len(mesh.rest)), triangle)
-        assert np.linalg.norm(mesh.rest[others] - centre, axis=1).min() > np.linalg.norm(
+        further = np.delete(np.arange(len(mesh.rest)), triangle)
+        assert np.linalg.norm(mesh.rest[further] - centre, axis=1).min() > np.linalg.norm(
             a - centre
         ) * (1.0 - 1e-6)
 

@@ -42,7 +42,7 @@ def test_refusals(change: dict[str, object], message: str) -> None:
 
 def test_names() -> None:
     assert all(settings.name == name for name, settings in PRESETS.items())
-    own = SolverSettings("own", 0.01)
-    assert preset_named(own) is own
+    custom = SolverSettings("own", 0.01)
+    assert preset_named(custom) is custom
     with pytest.raises(ValueError, match="preset: must be one of certified"):
         preset_named("best")

@@ -470,22 +470,22 @@ class TestNothingCrosses:
         ],
     )
     def test_tumbles(self, name: str) -> None:
-        seen = tumbles.watch(tumbles.tumble(name))
-        assert seen.crossing_steps == 0
-        assert 0.9 < seen.least_distance < 1.01  # they did touch themselves
-        assert seen.unconverged_steps == 0
+        history = tumbles.watch(tumbles.tumble(name))
+        assert history.crossing_steps == 0
+        assert 0.9 < history.least_distance < 1.01  # they did touch themselves
+        assert history.unconverged_steps == 0
 
     def test_crossings_are_seen(self) -> None:
         """Of a sheet whose corner is stuck through another one, and of one that lies in the same
         plane.
         """
-        one, two = meshes.grid(0.1, 0.1, 4, 4), meshes.unstructured(0.05, 0.05, 0.015, 1)
-        mesh = meshes.together(one, two)
-        both = np.concatenate([flat(one), flat(two)[:, [0, 2, 1]] + [0.003, 0.002, 0.01]])
+        large, two = meshes.grid(0.1, 0.1, 4, 4), meshes.unstructured(0.05, 0.05, 0.015, 1)
+        mesh = meshes.together(large, two)
+        both = np.concatenate([flat(large), flat(two)[:, [0, 2, 1]] + [0.003, 0.002, 0.01]])
         triangles = np.asarray(mesh.triangles)
         assert tumbles.crossings(both, triangles, both, triangles) > 0
         assert self_intersections(both, triangles) > 0
-        both[len(one.rest) :] = flat(two) + np.array([0.003, 0.002, 0.0])
+        both[len(large.rest) :] = flat(two) + np.array([0.003, 0.002, 0.0])
         assert tumbles.crossings(both, triangles, both, triangles) == 0
 
     def test_no_such_tumble(self) -> None:
@@ -566,9 +566,9 @@ class TestNothingCrosses:
 
         Friction acts on both sides of the thickness, and so turns: by the thickness times friction.
         """
-        seen = tumbles.tumble("folding-0")
-        tumbles.watch(seen, 100)
-        sums = tumbles.balance(seen.cloth)
+        tumble = tumbles.tumble("folding-0")
+        tumbles.watch(tumble, 100)
+        sums = tumbles.balance(tumble.cloth)
         assert sums.pairs > 5
         assert np.abs(sums.force).max() < 1e-15 * sums.size
         assert sums.moment == pytest.approx(

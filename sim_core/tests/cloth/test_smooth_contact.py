@@ -54,10 +54,10 @@ class TestFeet:
         errors, turns = [], []
         for subdivisions in (2, 3, 4):
             x, triangles = icosphere(subdivisions)
-            found, normal, point, _ = core.feet(triangles, x, CREASE, (1.0 + height) * d)
-            errors.append(np.abs(found - height).max())
+            heights, normal, point, _ = core.feet(triangles, x, CREASE, (1.0 + height) * d)
+            errors.append(np.abs(heights - height).max())
             turns.append(np.linalg.norm(normal - d, axis=1).max())
-            assert found[:, None] * normal + point == pytest.approx((1.0 + height) * d, abs=1e-12)
+            assert heights[:, None] * normal + point == pytest.approx((1.0 + height) * d, abs=1e-12)
         assert errors[0] < 6e-4
         assert np.divide(errors[:-1], errors[1:]).min() > 14.0
         assert np.divide(turns[:-1], turns[1:]).min() > 7.0
@@ -73,10 +73,10 @@ class TestFeet:
         )
         at = np.random.default_rng(1).uniform([0.0, -0.9], [6.3, 0.9], (500, 2))
         out = np.stack([np.cos(at[:, 0]), np.sin(at[:, 0]), 0.0 * at[:, 0]], axis=1)
-        found, normal, *_ = core.feet(
+        heights, normal, *_ = core.feet(
             triangles.astype(np.int32), x, CREASE, 1.01 * out + at[:, 1:] * [0.0, 0.0, 1.0]
         )
-        assert np.abs(found - 0.01).max() < 0.03 * (2.0 * np.pi / facets) ** 4
+        assert np.abs(heights - 0.01).max() < 0.03 * (2.0 * np.pi / facets) ** 4
         assert np.linalg.norm(normal - out, axis=1).max() < 0.05 * (2.0 * np.pi / facets) ** 3
 
     def test_normal_is_the_gradient_of_the_height_to_second_order(self) -> None:
@@ -99,14 +99,14 @@ class TestFeet:
         """At both ends of short ways from one triangle into another."""
         x, triangles = bumpy(2)
         for height in (0.95, 1.15):
-            one = height * directions(300, 3)
-            other = one + 0.1 * directions(300, 4)
-            first = np.asarray(core.feet(triangles, x, CREASE, one)[3])
+            inner = height * directions(300, 3)
+            other = inner + 0.1 * directions(300, 4)
+            first = np.asarray(core.feet(triangles, x, CREASE, inner)[3])
             for _ in range(35):
-                middle = 0.5 * (one + other)
+                middle = 0.5 * (inner + other)
                 stays = (np.asarray(core.feet(triangles, x, CREASE, middle)[3]) == first)[:, None]
-                one, other = np.where(stays, middle, one), np.where(stays, other, middle)
-            a, b = (core.feet(triangles, x, CREASE, p) for p in (one, other))
+                inner, other = np.where(stays, middle, inner), np.where(stays, other, middle)
+            a, b = (core.feet(triangles, x, CREASE, p) for p in (inner, other))
             changed = np.asarray(a[3]) != np.asarray(b[3])
             assert changed.mean() > 0.3
             assert a[0] == pytest.approx(b[0], abs=1e-9)
@@ -123,9 +123,9 @@ class TestFeet:
         p = p[np.abs(p).max(axis=1) > 1.0]
         away = p - np.clip(p, -1.0, 1.0)
         distance = np.linalg.norm(away, axis=1)
-        found, normal, *_ = core.feet(triangles, x, CREASE, p)
-        sign = np.sign(found[0])  # the first triangle decides which side is which
-        assert sign * found == pytest.approx(distance, abs=1e-12)
+        heights, normal, *_ = core.feet(triangles, x, CREASE, p)
+        sign = np.sign(heights[0])  # the first triangle decides which side is which
+        assert sign * heights == pytest.approx(distance, abs=1e-12)
         assert sign * normal == pytest.approx(away / distance[:, None], abs=1e-9)
 
     def test_distance_beyond_a_border(self) -> None:
@@ -135,21 +135,21 @@ class TestFeet:
         )
         p = np.random.default_rng(5).uniform(-0.5, 1.5, (1000, 3)) * [1.0, 1.0, 0.3]
         nearest = np.clip(p, [0.0, 0.0, 0.0], [1.0, 1.0, 0.0])
-        found, *_ = core.feet(triangles.astype(np.int32), x, CREASE, p)
-        assert np.abs(found) == pytest.approx(np.linalg.norm(p - nearest, axis=1), abs=1e-12)
+        heights, *_ = core.feet(triangles.astype(np.int32), x, CREASE, p)
+        assert np.abs(heights) == pytest.approx(np.linalg.norm(p - nearest, axis=1), abs=1e-12)
         inside = (nearest[:, :2] == p[:, :2]).all(axis=1)
-        assert found[inside] == pytest.approx(p[inside, 2], abs=1e-12)
+        assert heights[inside] == pytest.approx(p[inside, 2], abs=1e-12)
 
     def test_without_smooth_edges_it_is_the_triangles(self) -> None:
         x, triangles = icosphere(1)
         p = 1.05 * directions(500, 6)
-        found, normal, *_ = core.feet(triangles, x, 0.0, p)
+        heights, normal, *_ = core.feet(triangles, x, 0.0, p)
         for i in range(0, 500, 25):
             pairs = [np.vstack([p[i], x[corners]]) for corners in triangles]
             closest = min(
                 np.linalg.norm(core.closest_weights(False, four) @ four) for four in pairs
             )
-            assert found[i] == pytest.approx(closest, abs=1e-12)
+            assert heights[i] == pytest.approx(closest, abs=1e-12)
         assert np.linalg.norm(normal, axis=1) == pytest.approx(1.0)
 
 
@@ -322,17 +322,17 @@ class TestCloth:
         """Vertices keep 6 mm from the ball, and coarse triangles are up to 7 mm below it: nodes
         must find them.
         """
-        soft, found, touching = isotropic(0.2, 200.0, 2e-6), [], []
+        soft, heights, touching = isotropic(0.2, 200.0, 2e-6), [], []
         for subdivisions in (1, 3):
             x, triangles = ball(0.1, subdivisions)
             cloth = over(Surface(triangles, x, 0.5), 0.12, meshes.grid(0.36, 0.36, 8, 8), soft)
             for _ in range(150):
                 cloth.step(0.01, damping=10.0)
             touching.append(cloth.contacts >= 0)
-            found.append(cloth.positions)
+            heights.append(cloth.positions)
         assert np.count_nonzero(touching[0]) > 15
         assert np.array_equal(touching[0], touching[1])
-        assert found[0] == pytest.approx(found[1], abs=1e-3)
+        assert heights[0] == pytest.approx(heights[1], abs=1e-3)
 
     def test_what_starts_nearer_than_it_may_be_is_not_thrown_off(self) -> None:
         """A coarse sheet 1 mm over a ball has to be 5 mm off: it gets there, and falls on as freely

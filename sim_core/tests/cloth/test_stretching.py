@@ -50,7 +50,7 @@ def test_a_closed_loop_of_strain_takes_no_work(name: str, size: float) -> None:
         0.4 * np.sin(angle),
     )
     strain = size * np.stack([[warp, shear], [shear, weft]]).transpose(2, 0, 1)
-    stress = np.array([sheet.at(one)[1] for one in strain])
+    stress = np.array([sheet.at(tensor)[1] for tensor in strain])
     # Along a parabola through three points dG/ds is linear in s.
     start, middle, end = strain[:-1:2], strain[1::2], strain[2::2]
     rates = (-3 * start + 4 * middle - end, end - start, start - 4 * middle + 3 * end)
@@ -88,20 +88,22 @@ def test_stress_is_that_of_the_table(name: str, size: float) -> None:
                 ]
             )
 
-        def strained(width: float, along: Floats = along, across: Floats = across) -> Floats:
+        def stretched(width: float, along: Floats = along, across: Floats = across) -> Floats:
             return pulled * (np.outer(along, along) + width * np.outer(across, across))
 
         def free(stress: Callable[[Floats], Floats], across: Floats = across) -> float:
             return float(
                 newton(
-                    lambda width: float(across @ stress(strained(width)) @ across), 0.0, x1=-0.05
+                    lambda width: float(across @ stress(stretched(width)) @ across), 0.0, x1=-0.05
                 )
             )
 
-        held = along @ law(strained(0.0)) @ along
-        assert along @ sheet.at(strained(0.0))[1] @ along == pytest.approx(held, rel=1e-3)
-        ours, tables = (
-            along @ stress(strained(free(stress))) @ along
+        held = along @ law(stretched(0.0)) @ along
+        assert along @ sheet.at(stretched(0.0))[1] @ along == pytest.approx(held, rel=1e-3)
+        measured, tables = (
+            along @ stress(stretched(free(stress))) @ along
             for stress in (lambda G: sheet.at(G)[1], law)
         )
-        assert ours == pytest.approx(tables, rel=0.055 if name == "navy-sparkle-sweat" else 0.05)
+        assert measured == pytest.approx(
+            tables, rel=0.055 if name == "navy-sparkle-sweat" else 0.05
+        )

@@ -12,6 +12,7 @@
 
 #include "cloth/assembly.hpp"
 #include "contact/closest.hpp"
+#include "contact/contact_set.hpp"
 #include "contact/linearized_contact.hpp"
 #include "contact/path.hpp"
 #include "contact/pn_triangles.hpp"
@@ -213,12 +214,46 @@ NB_MODULE(_testing, m) {
             smoothing > 0.0 ? smoothed_law(contact, smoothing) : coulomb_law(contact);
         const PairRow row = pair_row(contact, law, {along, across});
         return std::make_tuple(static_cast<int>(row.mode), row.stiffness, row.symmetric, row.force,
-                               missed_squared(contact, smoothing));
+                               missed_squared(contact, smoothing), row.turning);
       },
       "gap"_a, "normal"_a, "slip"_a, "force"_a, "mu"_a, "stiffness"_a, "along"_a, "across"_a,
       "smoothing"_a = 0.0,
-      "mode, stiffness, its symmetric part, force and squared error; see "
+      "mode, stiffness, its symmetric part, force, squared error and turning; see "
       "contact/linearized_contact.hpp.");
+  m.def(
+      "closing",
+      [](double gap, const Eigen::Vector3d& normal, const Eigen::Vector3d& slip,
+         const Eigen::Vector3d& force, double mu, double stiffness, const Eigen::Vector3d& motion) {
+        const LawResponse law = closing({gap, normal, slip, force, mu, stiffness}, motion);
+        return std::make_tuple(static_cast<int>(law.mode), law.direction);
+      },
+      "gap"_a, "normal"_a, "slip"_a, "force"_a, "mu"_a, "stiffness"_a, "motion"_a,
+      "mode and direction of friction of an open contact that a motion closes; see "
+      "contact/coulomb_law.hpp.");
+  m.def(
+      "pair_changes",
+      [](const Four& weights, const Eigen::Vector3d& force, const Eigen::Vector3d& row_force,
+         const Eigen::Matrix3d& row_stiffness, const Eigen::Matrix<double, 2, 9>& sliding,
+         const Eigen::Matrix<double, 3, 9>& turning, const Four& displacements) {
+        Pair pair{};
+        pair.stencil.node = {0, 1, 2, 3};
+        pair.weights = weights.col(0);
+        pair.along_first = weights.col(1);
+        pair.along_second = weights.col(2);
+        pair.contact.force = force;
+        pair.row.force = row_force;
+        pair.row.stiffness = row_stiffness;
+        pair.sliding = sliding;
+        pair.turning = turning;
+        Buffer<float> change(16);
+        for (int c = 0; c < 4; ++c)
+          at_node(change, c) = displacements.row(c).transpose().cast<float>();
+        return std::make_tuple(pair.motions(change, 4), pair.force_change(change, 4),
+                               pair.stiffness());
+      },
+      "weights"_a, "force"_a, "row_force"_a, "row_stiffness"_a, "sliding"_a, "turning"_a,
+      "displacements"_a,
+      "motions, change of the force and stiffness of a pair; see contact/contact_set.hpp.");
   m.def(
       "node_row",
       [](double gap, const Eigen::Vector3d& normal, const Eigen::Vector3d& slip,

@@ -123,21 +123,21 @@ class TestLateralBuckling:
 class TestLimits:
     def test_of_a_power(self) -> None:
         sizes = ((0.1,), (0.06,), (0.03,))
-        found = Refinement.of(
+        refinement = Refinement.of(
             ((10.0,), (17.0,), (33.0,)), sizes, tuple((3.0 + 2.0 * h**1.7,) for (h,) in sizes)
         )
-        assert found.limit[0] == pytest.approx(3.0)
-        assert found.order[0] == pytest.approx(1.7)
+        assert refinement.limit[0] == pytest.approx(3.0)
+        assert refinement.order[0] == pytest.approx(1.7)
 
     def test_without_an_order(self) -> None:
         """Values that go to and fro: the order is that of theory, and the certificate gives the one
         of theory.
         """
-        found = Refinement.of(
+        refinement = Refinement.of(
             ((10.0,), (20.0,), (40.0,)), ((0.4,), (0.2,), (0.1,)), ((1.0,), (1.3,), (1.2,))
         )
-        assert math.isnan(found.order[0])
-        assert found.limit[0] == pytest.approx(1.2 - 0.1 / 3.0)
+        assert math.isnan(refinement.order[0])
+        assert refinement.limit[0] == pytest.approx(1.2 - 0.1 / 3.0)
 
     def test_a_wrong_limit_fails(self) -> None:
         refinement = Refinement(((1.0,),) * 3, ((1.0,),) * 3, (1.002,), (2.0,))

@@ -99,9 +99,13 @@ class TestStickSlip:
             return np.array([y[1], y[2], y[3] - 1 + strain])
 
         load = 20.19
-        found = root(miss, [load, 0.48 * np.sqrt(strain) * load, -9.0 * np.sqrt(strain)], tol=1e-13)
-        assert np.abs(found.fun).max() < 1e-11
-        assert master_curves.stick_slip(strain) == pytest.approx(found.x[1] / found.x[0], rel=1e-8)
+        solution = root(
+            miss, [load, 0.48 * np.sqrt(strain) * load, -9.0 * np.sqrt(strain)], tol=1e-13
+        )
+        assert np.abs(solution.fun).max() < 1e-11
+        assert master_curves.stick_slip(strain) == pytest.approx(
+            solution.x[1] / solution.x[0], rel=1e-8
+        )
 
     def test_small_strains(self) -> None:
         strain = np.array([1e-14, 1e-8, 1e-6])
@@ -162,9 +166,9 @@ def jacobi_fields(gamma: float, phi: float, poisson: float) -> tuple[Floats, Flo
     # upright.
     ends = ((tip, shoot(tip, 1e-6).y[0, -1]) for tip in np.linspace(0.5, 5.0, 46))
     low, high = next((a[0], b[0]) for a, b in pairwise(ends) if a[1] < 0 < b[1])
-    found = shoot(brentq(lambda tip: shoot(tip).y[0, -1], low, high, xtol=1e-15, rtol=1e-15))
+    solution = shoot(brentq(lambda tip: shoot(tip).y[0, -1], low, high, xtol=1e-15, rtol=1e-15))
     x = np.linspace(0, 1, 401)
-    return found.sol(x)[4], found.sol(x)[5]
+    return solution.sol(x)[4], solution.sol(x)[5]
 
 
 @pytest.mark.physics

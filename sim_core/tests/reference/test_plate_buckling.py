@@ -47,10 +47,10 @@ def ritz_weight(aspect: float, poisson: float, n: int) -> float:
     W = weights[:, None]
     uu, vv = f_x.T @ (W * f_x) + G * f_y.T @ (W * f_y), f_y.T @ (W * f_y) + G * f_x.T @ (W * f_x)
     uv = poisson * f_x.T @ (W * f_y) + G * f_y.T @ (W * f_x)
-    found = np.linalg.solve(
+    coefficients = np.linalg.solve(
         np.block([[uu, uv], [uv.T, vv]]), np.concatenate([np.zeros(n * n), -f.T @ weights])
     )
-    u, v = found[: n * n], found[n * n :]
+    u, v = coefficients[: n * n], coefficients[n * n :]
     N = f_x @ u + poisson * f_y @ v, f_y @ v + poisson * f_x @ u, G * (f_y @ u + f_x @ v)
 
     X = along(2)

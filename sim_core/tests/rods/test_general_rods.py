@@ -76,11 +76,11 @@ def test_without_weight_it_is_the_natural_shape() -> None:
 def test_stiffnesses_scale_against_the_weight() -> None:
     natural, gamma = varying(5, seed=6)
     K = np.array([0.5, 0.8, 1.2])
-    one, two = (
+    single, two = (
         solve_general_rods(natural, gamma, stiffness=K),
         solve_general_rods(natural, 2 * gamma, stiffness=2 * K),
     )
-    np.testing.assert_allclose(one.centerline, two.centerline, atol=1e-12)
+    np.testing.assert_allclose(single.centerline, two.centerline, atol=1e-12)
 
 
 def test_turn_about_the_vertical_turns_the_rod() -> None:
@@ -95,12 +95,12 @@ def test_turn_about_the_vertical_turns_the_rod() -> None:
 def test_roll_of_the_frame_is_a_roll_of_stiffness_and_curvature() -> None:
     """A quarter turn of the material axes about the tangent swaps the bends."""
     natural, gamma = varying(5, seed=8)
-    one = solve_general_rods(natural, gamma, stiffness=(0.6, 0.8, 1.3))
+    solution = solve_general_rods(natural, gamma, stiffness=(0.6, 0.8, 1.3))
     quarter = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])  # new d2 = d3, new d3 = -d2
     other = solve_general_rods(
         natural @ quarter, gamma, stiffness=(0.6, 1.3, 0.8), clamp_frame=CLAMP_FRAME @ quarter
     )
-    np.testing.assert_allclose(other.centerline, one.centerline, atol=1e-9)
+    np.testing.assert_allclose(other.centerline, solution.centerline, atol=1e-9)
 
 
 def test_free_end_has_natural_curvature() -> None:
@@ -111,11 +111,11 @@ def test_free_end_has_natural_curvature() -> None:
 
 def test_start_of_the_other_hand_finds_the_other_minimum() -> None:
     natural = np.array([[[0.3, 0.0, 15.0]]])
-    own = solve_general_rods(natural, [600.0])
-    other = solve_general_rods(natural, [600.0], start_curvature=own.curvature * [-1, -1, 1])
+    solution = solve_general_rods(natural, [600.0])
+    other = solve_general_rods(natural, [600.0], start_curvature=solution.curvature * [-1, -1, 1])
     assert other.stable.all()
-    assert largest_distance(own, other)[0] > 0.01
-    assert other.energy[0] > own.energy[0]
+    assert largest_distance(solution, other)[0] > 0.01
+    assert other.energy[0] > solution.energy[0]
 
 
 def test_every_kernel_gives_the_same_bits() -> None:

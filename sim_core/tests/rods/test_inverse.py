@@ -99,9 +99,9 @@ def test_leading_shape_is_kept(solved: RodSolution) -> None:
     result = natural_curvature(kappa, frame, gamma, stiffness=np.ones((2, 2, 3)))
     assert result.curvature.shape == (2, 2, 150, 3)
     assert result.amplification.shape == (2, 2)
-    one = natural_curvature(kappa[1, 0], frame[1, 0], 300.0, stiffness=(1, 1, 1))
-    np.testing.assert_allclose(one.curvature, result.curvature[1, 0])
-    assert one.amplification.shape == ()
+    natural = natural_curvature(kappa[1, 0], frame[1, 0], 300.0, stiffness=(1, 1, 1))
+    np.testing.assert_allclose(natural.curvature, result.curvature[1, 0])
+    assert natural.amplification.shape == ()
     clamps = np.broadcast_to(solved.frame[0, 0], (2, 2, 3, 3))
     assert natural_curvature(kappa, None, gamma, clamp_frame=clamps).curvature.shape == (
         2,

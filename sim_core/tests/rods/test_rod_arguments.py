@@ -105,6 +105,6 @@ def test_other_threads_run_meanwhile() -> None:
 
 
 def test_numbers_are_a_single_rod() -> None:
-    one, same = solve_rods(500, 4, 12), solve_rods([500.0], [4.0], [12.0])
-    assert one.centerline.shape == (1, 150, 3)
-    assert (one.centerline == same.centerline).all()
+    single, same = solve_rods(500, 4, 12), solve_rods([500.0], [4.0], [12.0])
+    assert single.centerline.shape == (1, 150, 3)
+    assert (single.centerline == same.centerline).all()

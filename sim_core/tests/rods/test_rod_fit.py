@@ -112,8 +112,8 @@ class TestParameters:
             for f, k in zip(fits, solved.curvature[:40], strict=True)
         ]
         assert np.median(errors) < 0.015  # 0.5 % over 50 rods; an earlier study's: 1.1 %
-        found = np.array([(f.gamma, f.phi0, f.phi1) for f in fits])
-        pulls = (found - thesis_rods[:40]) / np.array([f.standard_error for f in fits])
+        parameters = np.array([(f.gamma, f.phi0, f.phi1) for f in fits])
+        pulls = (parameters - thesis_rods[:40]) / np.array([f.standard_error for f in fits])
         assert 0.6 < np.sqrt((pulls**2).mean()) < 1.5
 
     def test_known_weight(self, thesis_rods: Floats, solved: RodSolution) -> None:

@@ -65,28 +65,28 @@ def test_bad_centerline() -> None:
 
 class TestOtherMinima:
     def test_weak_twist_leaves_both_hands_stable(self) -> None:
-        found = other_minima([600.0, 600.0], [0.3, 10.0], [15.0, 15.0])
-        np.testing.assert_array_equal(found.multistable, [True, False])
-        assert found.energy[0] - solve_rods([600.0], [0.3], [15.0]).energy[0] > 0.1
-        assert np.isfinite(found.centerline[0]).all()
-        assert np.isnan(found.energy[1])
-        assert np.isnan(found.centerline[1]).all()
+        minima = other_minima([600.0, 600.0], [0.3, 10.0], [15.0, 15.0])
+        np.testing.assert_array_equal(minima.multistable, [True, False])
+        assert minima.energy[0] - solve_rods([600.0], [0.3], [15.0]).energy[0] > 0.1
+        assert np.isfinite(minima.centerline[0]).all()
+        assert np.isnan(minima.energy[1])
+        assert np.isnan(minima.centerline[1]).all()
 
     def test_mirrored_family(self) -> None:
         """phi0 = 0 but for a hair: both hands have the same energy."""
-        found = other_minima([600.0], [1e-9], [15.0])
-        assert found.multistable[0]
-        assert found.energy[0] == pytest.approx(
+        minima = other_minima([600.0], [1e-9], [15.0])
+        assert minima.multistable[0]
+        assert minima.energy[0] == pytest.approx(
             solve_rods([600.0], [1e-9], [15.0]).energy[0], abs=1e-4
         )
 
     def test_only_where_twist_is_weak(self, thesis_rods: Floats, solved: RodSolution) -> None:
-        found = other_minima(*thesis_rods.T, solution=solved)
-        _, phi0, phi1 = thesis_rods[found.multistable].T
-        assert 10 < found.multistable[:400].sum() < 40  # 4.7 % of 2,000 over the ranges
+        minima = other_minima(*thesis_rods.T, solution=solved)
+        _, phi0, phi1 = thesis_rods[minima.multistable].T
+        assert 10 < minima.multistable[:400].sum() < 40  # 4.7 % of 2,000 over the ranges
         assert phi0.max() < 4.2
         assert phi1.min() > 9.0
-        assert (found.energy[found.multistable] > solved.energy[found.multistable]).all()
+        assert (minima.energy[minima.multistable] > solved.energy[minima.multistable]).all()
 
     def test_bad_solution(self, solved: RodSolution) -> None:
         with pytest.raises(ValueError, match=r"solution: must be of 1 rods at 150 points"):

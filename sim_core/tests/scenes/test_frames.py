@@ -71,7 +71,7 @@ def test_no_frame_is_in_a_body(bodies: Callable[[float], Sequence[Body]]) -> Non
     """The cubic is by more than 0.05 mm, in the step of the impact."""
     frames = thrown(bodies)
     assert max(depth(cubic, bodies(time)) for time, cubic, _ in frames) > 5e-5
-    assert max(depth(shown.positions, bodies(time)) for time, _, shown in frames) <= 1.0001e-5
+    assert max(depth(frame.positions, bodies(time)) for time, _, frame in frames) <= 1.0001e-5
 
 
 @pytest.mark.physics
@@ -88,7 +88,7 @@ def test_no_frame_crosses_a_mesh() -> None:
 
     frames = thrown(lambda _: [], [surface])
     assert any(crosses(cubic) for _, cubic, _ in frames)
-    assert not any(crosses(shown.positions) for _, _, shown in frames)
+    assert not any(crosses(frame.positions) for _, _, frame in frames)
 
 
 @pytest.mark.physics
@@ -106,7 +106,7 @@ def test_a_vertex_that_a_holder_drives_into_a_body_is_shown_there() -> None:
         return cloth.gravity, start[[0]] - [0.0, 0.0, 0.02 * time], bodies(time)
 
     cloth.advance(0.301, motion)
-    shown = frame_at(cloth, 0.301, bodies)
+    frame = frame_at(cloth, 0.301, bodies)
     assert cloth.time > 0.301
-    assert shown.positions[0, 2] == pytest.approx(1e-3 - 0.02 * 0.301, abs=1e-5)
-    assert np.delete(shown.positions[:, 2], 0).min() >= -1.0001e-5
+    assert frame.positions[0, 2] == pytest.approx(1e-3 - 0.02 * 0.301, abs=1e-5)
+    assert np.delete(frame.positions[:, 2], 0).min() >= -1.0001e-5

@@ -105,7 +105,7 @@ class TestClothRun:
 
     def test_side_is_drawn_from_the_seed_and_followed(self) -> None:
         """The hung cloth bellies to the side of the bias; where it lands is a label of its own."""
-        seen = set()
+        sides = set()
         for seed in range(4):
             fallen = cloth_drag.scene("gray-interlock", 0.5, mesh=7, frames=18, seed=seed).run()
             assert 1e-3 <= fallen.labels["bias"] <= 3e-3
@@ -113,8 +113,8 @@ class TestClothRun:
             held = cloth_drag.held_by_holders(meshes.grid(cloth_drag.SIDE, cloth_drag.SIDE, 6, 6))
             offset = fallen.positions[17, :, 0].mean() - fallen.positions[17, held, 0].mean()
             assert fallen.labels["landed_side"] == np.sign(offset)
-            seen.add(fallen.labels["bias_side"])
-        assert seen == {-1, 1}
+            sides.add(fallen.labels["bias_side"])
+        assert sides == {-1, 1}
         assert (
             cloth_drag.scene("gray-interlock", 0.5, mesh=7, frames=17).run().labels["landed_side"]
             == 0
@@ -143,7 +143,7 @@ class TestClothRun:
     def test_hangs_under_its_gravity(self) -> None:
         """A scene that is turned has the turned shape, and half the gravity another one."""
         mesh = meshes.grid(cloth_drag.SIDE, cloth_drag.SIDE, 8, 8)
-        made = fabric("gray-interlock")
+        cloth_fabric = fabric("gray-interlock")
         held = cloth_drag.held_by_holders(mesh)
         flat = np.column_stack([0.0 * mesh.rest[:, 0], mesh.rest])
         down = np.array([0.0, 0.0, -GRAVITY])
@@ -151,11 +151,17 @@ class TestClothRun:
         turn = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
         def shape(turn: Floats, gravity: Floats) -> Floats:
-            found = holders.hung(
-                mesh, made, flat @ turn.T, held, normal=turn[:, 0], seed=0, gravity=turn @ gravity
+            hung_shape = holders.hung(
+                mesh,
+                cloth_fabric,
+                flat @ turn.T,
+                held,
+                normal=turn[:, 0],
+                seed=0,
+                gravity=turn @ gravity,
             )
-            assert found.reason == ""
-            return found.positions @ turn
+            assert hung_shape.reason == ""
+            return hung_shape.positions @ turn
 
         upright = shape(np.eye(3), down)
         assert shape(turn, down) == pytest.approx(upright, abs=1e-6)
@@ -180,11 +186,11 @@ class TestClothRun:
         assert "did not come to rest" in scene.reason
 
     def test_frames_are_announced(self) -> None:
-        seen: list[tuple[int, int]] = []
+        announced: list[tuple[int, int]] = []
         cloth_drag.scene("gray-interlock", 0.5, mesh=5, frames=4).run(
-            lambda *done: seen.append(done)
+            lambda *done: announced.append(done)
         )
-        assert seen == [(2, 4), (3, 4), (4, 4)]
+        assert announced == [(2, 4), (3, 4), (4, 4)]
 
     def test_kernel_is_recorded(self) -> None:
         scene = cloth_drag.scene("gray-interlock", 0.5, mesh=5, frames=2, kernel="baseline").run()

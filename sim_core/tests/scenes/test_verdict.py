@@ -66,13 +66,13 @@ def test_a_run_that_ends_late_has_the_same_verdict(
 
 
 def test_a_valid_run_is_not_changed_by_the_looks(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = lowered(0.08).run()
+    judged = lowered(0.08).run()
     monkeypatch.setattr(checks.Verdict, "_look", lambda _verdict: None)
     unseen = lowered(0.08).run()
-    assert seen.valid
-    assert seen.times[-1] == SECONDS
-    assert np.array_equal(seen.positions, unseen.positions)
-    assert {name: seen.labels[name] for name in seen.labels} == unseen.labels
+    assert judged.valid
+    assert judged.times[-1] == SECONDS
+    assert np.array_equal(judged.positions, unseen.positions)
+    assert {name: judged.labels[name] for name in judged.labels} == unseen.labels
 
 
 def test_a_scene_without_a_valid_run_takes_no_step() -> None:

@@ -275,8 +275,8 @@ def test_an_entry_from_spec_to_table(rod_set, tmp_path):
     printed = runner.invoke(app, ["benchmark", "spec", "some-rods"])
     assert json.loads(printed.stdout)["kind"] == "rod_hang"
     assert "a set to test with" in runner.invoke(app, ["benchmark", "list"]).stdout
-    said = runner.invoke(app, ["benchmark", "check", "some-rods", str(rod_set.root)])
-    assert "is some-rods, published: " in said.stdout
+    result = runner.invoke(app, ["benchmark", "check", "some-rods", str(rod_set.root)])
+    assert "is some-rods, published: " in result.stdout
     records = []
     for method, factor in (("worse", 1.2), ("better", 1.05)):
         (tmp_path / "answers.json").write_text(json.dumps(rod_answers(rod_set, factor)))
@@ -288,7 +288,7 @@ def test_an_entry_from_spec_to_table(rod_set, tmp_path):
             str(tmp_path / "answers.json"),
             str(rod_set.root),
         ]
-        told = [
+        predicted = [
             "--method",
             method,
             "--by",
@@ -298,10 +298,10 @@ def test_an_entry_from_spec_to_table(rod_set, tmp_path):
             "--record",
             str(records[-1]),
         ]
-        done = runner.invoke(app, [*command, *told])
+        done = runner.invoke(app, [*command, *predicted])
         assert done.exit_code == 0, done.output
         first = records[-1].read_bytes()
-        assert runner.invoke(app, [*command, *told]).exit_code == 0
+        assert runner.invoke(app, [*command, *predicted]).exit_code == 0
         assert records[-1].read_bytes() == first  # anybody can check a record
     printed = runner.invoke(app, ["benchmark", "table", *map(str, records)])
     assert printed.stdout.index("better") < printed.stdout.index("worse")

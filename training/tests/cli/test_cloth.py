@@ -31,19 +31,22 @@ def packed(request):
 
 @pytest.fixture(scope="module")
 def clips(make_clips):
-    made = make_clips(
+    written = make_clips(
         rejected=(1,), axes=AXES, frames=30, splits={"train": 0.0, "validation": 0.0, "test": 1.0}
     )
-    made.edit_manifest(cameras=load_rig("drag"))
-    return made
+    written.edit_manifest(cameras=load_rig("drag"))
+    return written
 
 
 @pytest.mark.physics
 def test_train_and_resume(packed, tmp_path):
     with np.load(packed) as file:
         arrays = dict(file)
-    for name, some in (("train", slice(0, None, 12)), ("validation", slice(1, None, 48))):
-        part = {"differences": arrays["differences"][:, some], "about": arrays["about"][some]}
+    for name, slots_of_split in (("train", slice(0, None, 12)), ("validation", slice(1, None, 48))):
+        part = {
+            "differences": arrays["differences"][:, slots_of_split],
+            "about": arrays["about"][slots_of_split],
+        }
         np.savez(tmp_path / f"{name}.npz", **arrays | part)
     alone = [
         "cloth",
@@ -90,12 +93,12 @@ def test_predictions_of_a_dataset_are_a_list(clips):
 
 def test_the_clips_of_a_dataset_as_a_network_sees_them(clips):
     with DatasetReader(clips.root) as reader:
-        seen, slots = read_clips(reader, "test", ("11oz-black-denim",))
+        crops, slots = read_clips(reader, "test", ("11oz-black-denim",))
     assert slots.tolist() == [0, 2, 3]
-    assert seen.crops.shape == (3, 6, HEIGHT, WIDTH)
-    assert 0 <= seen.crops.min() <= seen.crops.max() <= 1
-    assert seen.material.tolist() == [-1, 0, 0]  # the other fabric is not known
-    assert seen.mu.tolist() == [0.1, 0.1, 0.4]
+    assert crops.crops.shape == (3, 6, HEIGHT, WIDTH)
+    assert 0 <= crops.crops.min() <= crops.crops.max() <= 1
+    assert crops.material.tolist() == [-1, 0, 0]  # the other fabric is not known
+    assert crops.mu.tolist() == [0.1, 0.1, 0.4]
 
 
 def test_what_cannot_be_measured_is_refused(clips, rods, make_clips):

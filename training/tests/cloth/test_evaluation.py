@@ -37,16 +37,16 @@ def truth(mu, material=None, run=None):
 def score(posterior, expected) -> Scores:
     """Score answers as they are printed."""
     slots = range(len(posterior))
-    told = predictions(posterior, slots, (np.ones(len(posterior)), [None] * len(posterior)))
-    return score_predictions(told, posterior.materials, slots, expected)
+    predicted = predictions(posterior, slots, (np.ones(len(posterior)), [None] * len(posterior)))
+    return score_predictions(predicted, posterior.materials, slots, expected)
 
 
 def test_a_neighbour_in_the_grid_of_the_thesis_is_never_below_a_tenth():
     grid = np.linspace(0, 1.5, 16)
     assert (np.abs(np.diff(grid)) < 0.1).any()  # what a plain comparison says
-    found = errors(Estimates(grid[1:], grid[1:], grid[1:]), grid[:-1], np.arange(15))
-    assert found.within_01.value == 0.0
-    assert found.within_02.value == 1.0
+    relative_errors = errors(Estimates(grid[1:], grid[1:], grid[1:]), grid[:-1], np.arange(15))
+    assert relative_errors.within_01.value == 0.0
+    assert relative_errors.within_02.value == 1.0
 
 
 def test_scores_of_known_answers():
@@ -67,8 +67,8 @@ def test_scores_of_known_answers():
 def test_calibrated_answers_are_reliable_and_overconfident_ones_are_not():
     generator = np.random.default_rng(2)
     mu = generator.uniform(0.4, 1.2, 1000)
-    seen = mu + generator.normal(0, 0.1, 1000)
-    good, bold = (answers(seen, deviation, np.zeros(1000, int)) for deviation in (0.1, 0.05))
+    measured = mu + generator.normal(0, 0.1, 1000)
+    good, bold = (answers(measured, deviation, np.zeros(1000, int)) for deviation in (0.1, 0.05))
     assert 0.75 < score(good, truth(mu)).blind.coverage.value < 0.85
     assert score(bold, truth(mu)).blind.coverage.value < 0.55
     material = np.zeros(1000, int)
@@ -87,10 +87,10 @@ def test_uncertainty_counts_simulations_and_not_clips():
 def test_printed_predictions_score_as_the_posteriors_do():
     mu, material = np.array([0.2, 0.6, 1.0]), np.array([0, 1, 2])
     posterior = answers(mu + 0.03, 0.06, [0, 1, 1])
-    told = json.loads(json.dumps(predictions(posterior, [4, 7, 9], ALL_KNOWN)))
-    assert set(told[0]) == {"slot", "material", "mu", "familiarity", "no_answer"}
-    assert sum(told[0]["material"].values()) == pytest.approx(1.0, abs=1e-5)
-    scores = score_predictions(told, posterior.materials, [4, 7, 9], truth(mu, material))
+    document = json.loads(json.dumps(predictions(posterior, [4, 7, 9], ALL_KNOWN)))
+    assert set(document[0]) == {"slot", "material", "mu", "familiarity", "no_answer"}
+    assert sum(document[0]["material"].values()) == pytest.approx(1.0, abs=1e-5)
+    scores = score_predictions(document, posterior.materials, [4, 7, 9], truth(mu, material))
     direct = errors(estimates(posterior.mu, BINS), mu, np.arange(3))
     assert scores.blind.mae.value == pytest.approx(direct.mae.value, abs=1e-5)
     assert scores.blind.coverage.value == direct.coverage.value
@@ -112,37 +112,37 @@ def test_printed_predictions_score_as_the_posteriors_do():
     ],
 )
 def test_a_file_of_predictions_is_checked(change, message):
-    told = predictions(answers([0.2, 0.6, 1.0], 0.06, [0, 1, 1]), [4, 7, 9], ALL_KNOWN)
-    change(told)
+    predicted = predictions(answers([0.2, 0.6, 1.0], 0.06, [0, 1, 1]), [4, 7, 9], ALL_KNOWN)
+    change(predicted)
     with pytest.raises(ValueError, match=message):
-        score_predictions(told, ("a", "b", "c"), [4, 7, 9], truth([0.5] * 3))
+        score_predictions(predicted, ("a", "b", "c"), [4, 7, 9], truth([0.5] * 3))
 
 
 def test_an_interval_that_reaches_the_largest_known_mu_says_above():
     joint = np.zeros((2, 1, 64))
     joint[0, 0, 60:] = 0.25
     joint[1, 0, 30:34] = 0.25
-    told = predictions(Posterior(("cloth",), BINS, joint), [0, 1], (np.ones(2), [None] * 2))
-    assert [answer["mu"]["above"] for answer in told] == [1.6, None]
+    predicted = predictions(Posterior(("cloth",), BINS, joint), [0, 1], (np.ones(2), [None] * 2))
+    assert [answer["mu"]["above"] for answer in predicted] == [1.6, None]
 
 
 def test_a_clip_without_an_answer_has_no_mu_and_scores_as_the_prior():
-    told = predictions(
+    predicted = predictions(
         answers([0.2, 0.6, 1.0], 0.06, [0, 1, 1]),
         [4, 7, 9],
         (np.array([1, 0.01, 1]), [None, "glued", None]),
     )
-    assert [(each["mu"] is None, each["no_answer"]) for each in told] == [
+    assert [(each["mu"] is None, each["no_answer"]) for each in predicted] == [
         (False, None),
         (True, "glued"),
         (False, None),
     ]
-    scores = score_predictions(told, ("a", "b", "c"), [4, 7, 9], truth([0.2, 0.6, 1.0]))
+    scores = score_predictions(predicted, ("a", "b", "c"), [4, 7, 9], truth([0.2, 0.6, 1.0]))
     assert scores.blind.mae.value == pytest.approx((0.0 + 0.2 + 0.0) / 3, abs=0.01)
 
 
 def test_the_interval_score_is_the_width_and_ten_times_what_is_beyond():
-    found = Estimates(np.array([0.5, 0.5]), np.array([0.4, 0.4]), np.array([0.6, 0.6]))
-    assert errors(found, np.array([0.5, 0.7]), np.arange(2)).interval.value == pytest.approx(
+    estimated = Estimates(np.array([0.5, 0.5]), np.array([0.4, 0.4]), np.array([0.6, 0.6]))
+    assert errors(estimated, np.array([0.5, 0.7]), np.arange(2)).interval.value == pytest.approx(
         (0.2 + 0.2 + 10 * 0.1) / 2
     )

@@ -45,15 +45,15 @@ def test_a_twentieth_of_the_good_and_nearly_all_others_have_no_answer(few, split
     assert ((share >= 0) & (share <= 1)).all()
     assert np.mean([reason is not None for reason in reasons]) == pytest.approx(ALARMS, abs=0.03)
     held = holders_at(INSTANTS)
-    for made, reason in (
+    for foreign, reason in (
         (hanging, "never touches the floor"),
         (partial(reordered, frames=[2, 3, 0, 1, 2, 3]), "moves out of phase"),
     ):
         clips = render_clips(
-            replace(judged, positions=made(judged.positions, held)), 4, 3, with_surroundings=True
+            replace(judged, positions=foreign(judged.positions, held)), 4, 3, with_surroundings=True
         )
-        told = known.judge(silhouettes(clips))[1]
-        assert np.mean([each == reason for each in told]) > 0.8
+        answers = known.judge(silhouettes(clips))[1]
+        assert np.mean([each == reason for each in answers]) > 0.8
     noise = np.random.default_rng(0).random((3, 6, 18, 22), dtype=np.float32)
     assert known.judge(noise)[0].tolist() == [0.0] * 3
 

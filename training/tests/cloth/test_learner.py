@@ -121,28 +121,28 @@ def test_every_render_has_a_look_of_its_own_and_the_seed_repeats_it(few):
 def test_temperatures_mend_what_is_too_sure():
     generator = np.random.default_rng(0)
     truth = generator.uniform(0.3, 1.3, 2000)
-    seen = truth + generator.normal(0, 0.1, 2000)
+    measured = truth + generator.normal(0, 0.1, 2000)
     log = (
-        -0.5 * ((MU_BINS.centers - seen[:, None]) / 0.05) ** 2
+        -0.5 * ((MU_BINS.centers - measured[:, None]) / 0.05) ** 2
     )  # as if the deviation was 0.05: temperature (0.1/0.05)^2
     mu = np.repeat(log[:, None], 2, axis=1).astype(np.float32)
     material = np.tile(
         np.float32([0.0, np.log(4.0)]), (2000, 1)
     )  # 80 %, and it is so in 80 % of the cases
     code = (np.arange(2000) % 5 > 0).astype(int)
-    found = likeliest_temperatures(material, mu, code, truth, MU_BINS)
-    assert found[0] == pytest.approx(1.0, abs=0.1)
-    assert found[1] == pytest.approx(4.0, rel=0.1)
+    temperatures = likeliest_temperatures(material, mu, code, truth, MU_BINS)
+    assert temperatures[0] == pytest.approx(1.0, abs=0.1)
+    assert temperatures[1] == pytest.approx(4.0, rel=0.1)
 
 
 def test_intervals_of_a_network_that_is_twice_too_sure_become_twice_as_wide():
     random = np.random.default_rng(0)
     mu = random.uniform(0.5, 1.1, 500)
-    told = mu + random.normal(0.0, 0.1, 500)
-    log_mu = (-0.5 * ((MU_BINS.centers - told[:, None]) / 0.05) ** 2)[:, None]
+    answered = mu + random.normal(0.0, 0.1, 500)
+    log_mu = (-0.5 * ((MU_BINS.centers - answered[:, None]) / 0.05) ** 2)[:, None]
     # A Gaussian histogram at temperature T is sqrt(T) as wide.
-    found = covering_temperature(np.zeros((500, 1), np.float32), log_mu, mu, MU_BINS, 1.0)
-    assert found == pytest.approx(4.0, rel=0.15)
+    temperature = covering_temperature(np.zeros((500, 1), np.float32), log_mu, mu, MU_BINS, 1.0)
+    assert temperature == pytest.approx(4.0, rel=0.15)
 
 
 @pytest.mark.parametrize(
@@ -210,14 +210,14 @@ def test_a_step_learns_from_the_last_batches_and_half_of_their_clips_are_mirrore
     for step, count in ((0, 1), (1, 1), (2, 2), (5, 3)):
         known = [torch.cat(column) for column in zip(*drawn[:count], strict=True)]
         plain = mirrored = 0
-        for crops, direction, material, mu, seen in zip(*learner.sample(step), strict=True):
+        for crops, direction, material, mu, clip_number in zip(*learner.sample(step), strict=True):
             place = (known[3] == mu).nonzero().flatten().tolist()
             same = [k for k in place if torch.equal(known[0][k], crops)]
             other = [k for k in place if torch.equal(known[0][k].flip(2), crops)]
             assert len(same) + len(other) == 1
             k = (same + other)[0]
             plain, mirrored = plain + len(same), mirrored + len(other)
-            assert torch.equal(known[4][k] if same else known[4][k].flip(2), seen)
+            assert torch.equal(known[4][k] if same else known[4][k].flip(2), clip_number)
             assert material == known[2][k]
             assert torch.equal(
                 direction, known[1][k] * torch.tensor([1.0, 1.0 if same else -1.0, 1.0])
@@ -267,18 +267,20 @@ def test_a_model_of_another_size_is_no_start(few, first):
         train_friction(*few[:2], replace(SMALL, width=96), start=first)
 
 
-def file_of_clips(path, shown):
-    video = np.random.default_rng(0).integers(0, 255, (len(shown), 6, 224, 224, 3), dtype=np.uint8)
+def file_of_clips(path, clips_of_file):
+    video = np.random.default_rng(0).integers(
+        0, 255, (len(clips_of_file), 6, 224, 224, 3), dtype=np.uint8
+    )
     classes = np.random.default_rng(1).integers(0, 4, video.shape[:-1], dtype=np.uint8)
     about = [
         {
             "run": 5,
-            "material": shown.materials[code],
+            "material": clips_of_file.materials[code],
             "mu": mu,
             "landed_side": 1,
             "viewpoint": "calibrated",
         }
-        for code, mu in zip(shown.material.tolist(), shown.mu.tolist(), strict=True)
+        for code, mu in zip(clips_of_file.material.tolist(), clips_of_file.mu.tolist(), strict=True)
     ]
     np.savez(
         path,

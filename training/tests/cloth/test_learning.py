@@ -31,8 +31,8 @@ def test_friction_of_unseen_simulations_is_learned_from_clips(runs, split_runs, 
     model = train_friction(train, validation, replace(QUICK, seed=seed))
     clips = render_clips(test, 6, 99)
     slots = range(len(clips))
-    told = predictions(model.estimate(clips), slots, ([1.0] * len(clips), [None] * len(clips)))
-    scores = score_predictions(told, model.materials, slots, clips)
+    predicted = predictions(model.estimate(clips), slots, ([1.0] * len(clips), [None] * len(clips)))
+    scores = score_predictions(predicted, model.materials, slots, clips)
     assert scores.blind.simulations >= 20
     assert scores.blind.mae.value <= 0.075
     assert scores.blind.within_02.value >= 0.9

@@ -11,35 +11,37 @@ def normal(center, deviation):
 
 
 def test_median_and_interval_of_a_normal_distribution():
-    found = estimates(normal([0.5, 0.803], 0.1), BINS)
-    assert found.median == pytest.approx([0.5, 0.803], abs=2e-3)
-    assert found.high - found.low == pytest.approx(2 * 1.2816 * 0.1, abs=6e-3)
-    assert (found.low + found.high) / 2 == pytest.approx([0.5, 0.803], abs=BINS.edges[1] / 2)
+    estimated = estimates(normal([0.5, 0.803], 0.1), BINS)
+    assert estimated.median == pytest.approx([0.5, 0.803], abs=2e-3)
+    assert estimated.high - estimated.low == pytest.approx(2 * 1.2816 * 0.1, abs=6e-3)
+    assert (estimated.low + estimated.high) / 2 == pytest.approx(
+        [0.5, 0.803], abs=BINS.edges[1] / 2
+    )
 
 
 def test_the_interval_is_the_shortest_and_not_the_central_one():
     weight = np.exp(-BINS.centers / 0.2)[None]
-    found = estimates(weight / weight.sum(), BINS)
-    assert found.low[0] == 0.0
-    assert found.high[0] == pytest.approx(0.2 * np.log(5), abs=0.01)
+    estimated = estimates(weight / weight.sum(), BINS)
+    assert estimated.low[0] == 0.0
+    assert estimated.high[0] == pytest.approx(0.2 * np.log(5), abs=0.01)
 
 
 def test_two_branches_are_not_averaged():
     both = 0.9 * normal([0.1], 0.02) + 0.1 * normal([1.3], 0.02)
-    found = estimates(both, BINS)
-    assert found.median[0] == pytest.approx(0.1, abs=0.02)
-    assert found.high[0] < 0.2
+    estimated = estimates(both, BINS)
+    assert estimated.median[0] == pytest.approx(0.1, abs=0.02)
+    assert estimated.high[0] < 0.2
 
 
 def test_the_share_is_that_asked_for():
     generator = np.random.default_rng(0)
     histogram = generator.dirichlet(np.full(64, 0.3), size=50)
     for share in (0.5, 0.8):
-        found = estimates(histogram, BINS, share)
+        estimated = estimates(histogram, BINS, share)
         cumulated = np.concatenate([np.zeros((50, 1)), histogram.cumsum(axis=1)], axis=1)
         held = [
             np.interp(b, BINS.edges, c) - np.interp(a, BINS.edges, c)
-            for a, b, c in zip(found.low, found.high, cumulated, strict=True)
+            for a, b, c in zip(estimated.low, estimated.high, cumulated, strict=True)
         ]
         assert min(held) >= share - 1e-9
         assert np.mean(held) < share + 0.03

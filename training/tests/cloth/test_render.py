@@ -88,9 +88,9 @@ def test_what_is_nearer_hides_what_is_behind():
         )
         whole = Crops(torch.tensor(ANCHOR[::-1]).expand(1, 1, 2), torch.ones(1, 1))
         alpha, color = splat(points, colors, Cameras.of([camera]), whole, size=(48, 64))
-        seen = color[alpha > 0.9]
-        assert len(seen) > 60
-        assert (seen == expected).float().mean() > 0.99
+        opaque_colors = color[alpha > 0.9]
+        assert len(opaque_colors) > 60
+        assert (opaque_colors == expected).float().mean() > 0.99
 
 
 def test_the_holders_move_as_in_the_simulations(runs):
@@ -174,7 +174,7 @@ def test_a_world_is_drawn_from_the_seed_about_the_same_cloth(runs):
     meshes = torch.from_numpy(runs.positions[:3, frames])
     cameras = Cameras.of(RIG)
 
-    def seen(seed, drawn=True):
+    def world_of(seed, drawn=True):
         generator = torch.Generator().manual_seed(seed)
         style, world = (
             sample_style(3, 6, generator),
@@ -182,7 +182,7 @@ def test_a_world_is_drawn_from_the_seed_about_the_same_cloth(runs):
         )
         return render_crops(meshes, cameras, instants, style, generator, world)
 
-    first, again, other, dark = seen(1), seen(1), seen(2), seen(1, drawn=False)
+    first, again, other, dark = world_of(1), world_of(1), world_of(2), world_of(1, drawn=False)
     assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
     assert not torch.equal(first[0], other[0])
     behind = (first[1] == 0) & (dark[1] == 0)
@@ -199,7 +199,7 @@ def test_a_codec_keeps_what_is_smooth():
     ramp = torch.linspace(0, 1, WIDTH).expand(2, 1, HEIGHT, WIDTH) + 0.02 * torch.randn(
         2, 1, HEIGHT, WIDTH
     )
-    kept = apply_codec(ramp, codec)
-    assert torch.equal(kept[1], ramp[1])
-    assert 0.001 < (kept[0] - ramp[0]).abs().mean() < 0.03
+    decoded = apply_codec(ramp, codec)
+    assert torch.equal(decoded[1], ramp[1])
+    assert 0.001 < (decoded[0] - ramp[0]).abs().mean() < 0.03
     assert torch.allclose(apply_codec(ramp, replace(codec, step=1e-4 * number)), ramp, atol=1e-3)

@@ -44,14 +44,14 @@ def pictures(run, seconds, floor=0.05):
     """
     lines = torch.linspace(0, 1, 112)
     checks = 0.35 + 0.3 * ((lines[:, None] * 20).floor() + (lines * 20).floor()).remainder(2)
-    found = []
+    frames = []
     for mesh in torch.from_numpy(meshes_at(run, seconds)).split(32):
         fine = refine(mesh[None], 112)
         whole = Crops(torch.tensor(ANCHOR[::-1]).expand(1, len(mesh), 2), torch.ones(1, len(mesh)))
         colors = checks.expand(fine.shape[:-1])
         alpha, color = splat(fine, colors, Cameras.of([CAMERA]), whole, size=(224, 224))
-        found.append((alpha * color + (1 - alpha) * floor)[0])
-    return torch.cat(found).numpy()
+        frames.append((alpha * color + (1 - alpha) * floor)[0])
+    return torch.cat(frames).numpy()
 
 
 def filmed(path, frames, shake):
@@ -66,19 +66,19 @@ def run(runs):
 
 
 @pytest.fixture(scope="module")
-def shown(run):
+def scene_of_film(run):
     """93 s after the start, nine pictures a second, and when each is taken."""
     seconds = np.arange(0.0, START + INSTANTS[-1] / RATE + 1.0, 1 / FRAMES_A_SECOND) - START
     return seconds, pictures(run, seconds, marks(0.01))
 
 
 @pytest.fixture(scope="module")
-def film(shown, tmp_path_factory):
+def film(scene_of_film, tmp_path_factory):
     """All pictures, with 1 px of shake."""
     path = tmp_path_factory.mktemp("film") / "film.mp4"
-    shake = np.random.default_rng(1).normal(0.0, 0.05, (len(shown[0]), 2)).cumsum(axis=0)
+    shake = np.random.default_rng(1).normal(0.0, 0.05, (len(scene_of_film[0]), 2)).cumsum(axis=0)
     shake -= shake[0]
-    filmed(path, shown[1], shake)
+    filmed(path, scene_of_film[1], shake)
     return path
 
 
@@ -93,22 +93,22 @@ def wanted_crops(run, floor=0.05):
 
 
 def test_start_shake_and_crops_are_found(imported, run):
-    clip, found = imported
-    assert found.start == pytest.approx(START, abs=0.03)
-    assert found.residual < 0.3
+    clip, recognized = imported
+    assert recognized.start == pytest.approx(START, abs=0.03)
+    assert recognized.residual < 0.3
     blind = (clip.crops - wanted_crops(run, marks(0.01))).abs().mean()
     assert blind < 0.02  # lens and codec; contrast is 0.3 to 0.6
     assert clip.direction[0].tolist() == pytest.approx(CAMERA.rotation[2])
 
 
 def test_a_film_that_begins_half_a_second_late_over_a_floor_without_marks_gives_the_same_crops(
-    run, shown, tmp_path
+    run, scene_of_film, tmp_path
 ):
-    seconds = shown[0][20:]
+    seconds = scene_of_film[0][20:]
     assert 0.5 < seconds[0] < 0.6
     filmed(tmp_path / "late.mp4", pictures(run, seconds), np.zeros((len(seconds), 2)))
-    clip, found = import_video(tmp_path / "late.mp4", LENS)
-    assert found.start == pytest.approx(-seconds[0], abs=0.05)
+    clip, recognized = import_video(tmp_path / "late.mp4", LENS)
+    assert recognized.start == pytest.approx(-seconds[0], abs=0.05)
     assert (clip.crops - wanted_crops(run)).abs().mean() < 0.01
 
 
@@ -201,12 +201,12 @@ def test_reasons_name_rule_and_value(imported):
     assert "are 2.50 px off" in wrong.refusals()[0]
 
 
-def test_a_floor_that_moves_apart_from_the_holders_is_refused(shown, tmp_path, monkeypatch):
-    filmed(tmp_path / "film.mp4", shown[1], np.zeros((len(shown[0]), 2)))
-    found = video._register
+def test_a_floor_that_moves_apart_from_the_holders_is_refused(scene_of_film, tmp_path, monkeypatch):
+    filmed(tmp_path / "film.mp4", scene_of_film[1], np.zeros((len(scene_of_film[0]), 2)))
+    registered = video._register
 
     def astray(*args):  # the patches slipped off the holders in the last third
-        registration, wanders = found(*args)
+        registration, wanders = registered(*args)
         wanders[600:] += 2.3
         return registration, wanders
 

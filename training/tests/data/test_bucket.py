@@ -36,11 +36,11 @@ def server():
         patch.undo()
 
 
-def put(made, prefix: str) -> str:
+def put(version, prefix: str) -> str:
     objects = obstore.store.S3Store("lab", prefix=prefix)
-    for path in made.root.rglob("*"):
+    for path in version.root.rglob("*"):
         if path.is_file():
-            obstore.put(objects, path.relative_to(made.root).as_posix(), path.read_bytes())
+            obstore.put(objects, path.relative_to(version.root).as_posix(), path.read_bytes())
     return f"s3://lab/{prefix}"
 
 
@@ -76,13 +76,13 @@ def test_a_sample_is_one_request(clips_url, server, monkeypatch):
 def test_workers_that_are_spawned_read_it(clips_url, clips):
     dataset = Samples(clips_url, "train")
     loader = dataset.loader(2, num_workers=1, multiprocessing_context="spawn")
-    found = {
+    read = {
         int(slot): video
         for batch in loader
         for slot, video in zip(batch["slot"], batch["video"], strict=True)
     }
-    assert sorted(found) == dataset.slots.tolist()
-    for slot, video in found.items():
+    assert sorted(read) == dataset.slots.tolist()
+    for slot, video in read.items():
         assert np.array_equal(video.numpy(), clips.arrays["video"][slot])
 
 
@@ -112,11 +112,11 @@ def test_a_server_that_refuses_is_told(server, clips_url, monkeypatch):
 
 
 def test_a_shard_that_is_too_short_is_told(server, clips, tmp_path):
-    made = clips.copy(tmp_path / "short")
-    path = made.root / "video/c/0/0/0/0/0"
+    version = clips.copy(tmp_path / "short")
+    path = version.root / "video/c/0/0/0/0/0"
     path.write_bytes(path.read_bytes()[:-100])
     with (
-        DatasetReader(put(made, "short")) as reader,
+        DatasetReader(put(version, "short")) as reader,
         pytest.raises((CorruptDataError, SourceError)),
     ):
         reader.read("video", reader.slots()[:1])

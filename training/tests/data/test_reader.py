@@ -22,16 +22,16 @@ from stickslip_training.data.sources import (
 
 @pytest.mark.parametrize("name", ["clips", "rods", "seen_rods"])
 def test_reads_bit_for_bit_what_zarr_python_wrote_and_reads(name, request):
-    made = request.getfixturevalue(name)
-    reader = DatasetReader(made.root, verify=True)
-    group = zarr.open_group(str(made.root), mode="r")
+    version = request.getfixturevalue(name)
+    reader = DatasetReader(version.root, verify=True)
+    group = zarr.open_group(str(version.root), mode="r")
     assert set(group.array_keys()) == set(reader.arrays)
     slots = reader.slots()
     shuffled = np.random.default_rng(0).permutation(slots)
     for array in reader.arrays:
         values = reader.read(array, shuffled)
-        assert values.dtype == made.arrays[array].dtype
-        assert values.tobytes() == made.arrays[array][shuffled].tobytes()
+        assert values.dtype == version.arrays[array].dtype
+        assert values.tobytes() == version.arrays[array][shuffled].tobytes()
         assert values.tobytes() == group[array][:][shuffled].tobytes()
 
 
@@ -127,8 +127,8 @@ def is_told(root, shard):
 @pytest.mark.physics
 def test_no_flipped_bit_is_silent(clips, tmp_path):
     """Single flips anywhere in the files of shards and labels: 6 in each file, and 100 more."""
-    made = clips.copy(tmp_path / "v1")
-    shards = [made.root / file.path for file in made.manifest.files if "/c/" in file.path]
+    version = clips.copy(tmp_path / "v1")
+    shards = [version.root / file.path for file in version.manifest.files if "/c/" in file.path]
     sizes = np.array([path.stat().st_size for path in shards])
     generator = np.random.default_rng(3)
     targets = np.concatenate(
@@ -142,51 +142,51 @@ def test_no_flipped_bit_is_silent(clips, tmp_path):
         damaged = bytearray(intact)
         damaged[bit // 8] ^= 1 << bit % 8
         path.write_bytes(damaged)
-        if not is_told(made.root, path):
+        if not is_told(version.root, path):
             silent.append((path.name, bit))
         path.write_bytes(intact)
     assert silent == []
 
 
 def test_the_message_about_a_corrupt_chunk_names_array_sample_and_file(clips, tmp_path):
-    made = clips.copy(tmp_path / "v1")
-    path = made.root / "video/c/0/0/0/0/0"
+    version = clips.copy(tmp_path / "v1")
+    path = version.root / "video/c/0/0/0/0/0"
     data = bytearray(path.read_bytes())
     data[100] ^= 1
     path.write_bytes(data)
-    reader = DatasetReader(made.root, check_shards=False)
+    reader = DatasetReader(version.root, check_shards=False)
     with pytest.raises(
         CorruptDataError,
         match=r"array video, sample 0, .*video/c/0/0/0/0/0: the crc32c of the chunk",
     ):
         reader.read("video", [0])
-    assert np.array_equal(reader.read("video", [1]), made.arrays["video"][[1]])
+    assert np.array_equal(reader.read("video", [1]), version.arrays["video"][[1]])
     with pytest.raises(
         CorruptDataError, match=r"video/c/0/0/0/0/0 has SHA-256 .*, and the manifest says"
     ):
-        DatasetReader(made.root).read("video", [1])
+        DatasetReader(version.root).read("video", [1])
     with pytest.raises(
         CorruptDataError, match=r"video/c/0/0/0/0/0 has SHA-256 .*, and the manifest says"
     ):
-        DatasetReader(made.root, verify=True)
+        DatasetReader(version.root, verify=True)
 
 
-@pytest.mark.parametrize("kept", [0, 3, 1000, -1])
-def test_a_truncated_shard_raises(clips, tmp_path, kept):
-    made = clips.copy(tmp_path / "v1")
-    path = made.root / "video/c/1/0/0/0/0"
-    path.write_bytes(path.read_bytes()[:kept])
-    reader = DatasetReader(made.root, check_shards=False)
+@pytest.mark.parametrize("remaining", [0, 3, 1000, -1])
+def test_a_truncated_shard_raises(clips, tmp_path, remaining):
+    version = clips.copy(tmp_path / "v1")
+    path = version.root / "video/c/1/0/0/0/0"
+    path.write_bytes(path.read_bytes()[:remaining])
+    reader = DatasetReader(version.root, check_shards=False)
     with pytest.raises(CorruptDataError, match=r"has \d+ bytes, and the manifest says"):
         reader.read("video", [8])
 
 
-@pytest.mark.parametrize("kept", [0, 3, 1000, -1])
-def test_a_truncated_shard_raises_where_the_manifest_agrees_with_it(clips, tmp_path, kept):
-    made = clips.copy(tmp_path / "v1")
+@pytest.mark.parametrize("remaining", [0, 3, 1000, -1])
+def test_a_truncated_shard_raises_where_the_manifest_agrees_with_it(clips, tmp_path, remaining):
+    version = clips.copy(tmp_path / "v1")
     path = "video/c/1/0/0/0/0"
-    made.rewrite(path, (made.root / path).read_bytes()[:kept])
-    reader = DatasetReader(made.root)
+    version.rewrite(path, (version.root / path).read_bytes()[:remaining])
+    reader = DatasetReader(version.root)
     with pytest.raises(
         CorruptDataError,
         match=r"array video.*(too short for a shard index|crc32c of the shard index)",
@@ -195,48 +195,48 @@ def test_a_truncated_shard_raises_where_the_manifest_agrees_with_it(clips, tmp_p
 
 
 def test_a_missing_shard_raises(clips, tmp_path):
-    made = clips.copy(tmp_path / "v1")
-    (made.root / "video/c/1/0/0/0/0").unlink()
-    reader = DatasetReader(made.root)
+    version = clips.copy(tmp_path / "v1")
+    (version.root / "video/c/1/0/0/0/0").unlink()
+    reader = DatasetReader(version.root)
     reader.read("video", [0])
     with pytest.raises(
         MissingFileError, match=r"video/c/1/0/0/0/0 is not there, and the manifest says it is"
     ):
         reader.read("video", [8])
-    (made.root / "valid/c/0").unlink()
+    (version.root / "valid/c/0").unlink()
     with pytest.raises(MissingFileError):
-        DatasetReader(made.root)
+        DatasetReader(version.root)
 
 
 def test_a_shard_that_is_not_in_the_manifest_raises_although_it_is_there(clips, tmp_path):
-    made = clips.copy(tmp_path / "v1")
-    files = made.manifest.files
-    made.edit_manifest(files=tuple(file for file in files if file.path != "video/c/1/0/0/0/0"))
+    version = clips.copy(tmp_path / "v1")
+    files = version.manifest.files
+    version.edit_manifest(files=tuple(file for file in files if file.path != "video/c/1/0/0/0/0"))
     with pytest.raises(
         MissingFileError, match=r"array video, shard 1: video/c/1/0/0/0/0 is not in the manifest"
     ):
-        DatasetReader(made.root)
+        DatasetReader(version.root)
 
 
 def test_a_valid_sample_without_a_chunk_raises(clips, tmp_path):
     """Another writer left a chunk out as if it were all fill value: zarr-python reads zeros."""
-    made = clips.copy(tmp_path / "v1")
-    group = zarr.open_group(str(made.root), mode="r+")
+    version = clips.copy(tmp_path / "v1")
+    group = zarr.open_group(str(version.root), mode="r+")
     group["video"][8] = 0
-    made.rewrite("video/c/1/0/0/0/0", (made.root / "video/c/1/0/0/0/0").read_bytes())
+    version.rewrite("video/c/1/0/0/0/0", (version.root / "video/c/1/0/0/0/0").read_bytes())
     with pytest.raises(CorruptDataError, match="array video, sample 8: its chunk is missing in"):
-        DatasetReader(made.root).read("video", [8])
+        DatasetReader(version.root).read("video", [8])
 
 
 def test_a_chunk_of_another_size_raises(clips, tmp_path):
     """A smaller chunk with a good checksum would leave a part of the buffer as it was."""
     from stickslip_schemas.format.codecs import encode_clip, encode_shard
 
-    made = clips.copy(tmp_path / "v1")
-    shape = made.arrays["video"].shape[1:]
+    version = clips.copy(tmp_path / "v1")
+    shape = version.arrays["video"].shape[1:]
     chunks = [encode_clip(np.ones(shape, np.uint8)[: 1 + (slot == 4)]) for slot in range(8)]
-    made.rewrite("video/c/0/0/0/0/0", encode_shard(chunks))
-    reader = DatasetReader(made.root)
+    version.rewrite("video/c/0/0/0/0/0", encode_shard(chunks))
+    reader = DatasetReader(version.root)
     assert reader.read("video", [4]).all()
     with pytest.raises(
         CorruptDataError, match=r"sample 2, .*the chunk decodes to 150528 bytes, and 301056"
@@ -256,8 +256,8 @@ NAMED = re.compile(r"manifest\.json|zarr\.json|manifest\.sha256")
 
 def test_no_flipped_bit_in_the_files_that_vouch_for_the_others_is_silent(rods, tmp_path):
     """2,000 single flips, in each file as many as its share of the bytes, and 100 at least."""
-    made = rods.copy(tmp_path / "v1")
-    paths = [made.root / name for name in ("manifest.json", "zarr.json", "manifest.sha256")]
+    version = rods.copy(tmp_path / "v1")
+    paths = [version.root / name for name in ("manifest.json", "zarr.json", "manifest.sha256")]
     sizes = np.array([path.stat().st_size for path in paths])
     generator = np.random.default_rng(4)
     counts = 100 + generator.multinomial(1700, sizes / sizes.sum())
@@ -269,14 +269,14 @@ def test_no_flipped_bit_in_the_files_that_vouch_for_the_others_is_silent(rods, t
             damaged[bit // 8] ^= 1 << bit % 8
             path.write_bytes(damaged)
             try:
-                DatasetReader(made.root)
+                DatasetReader(version.root)
             except DatasetError as error:
                 if NAMED.search(str(error)):
                     continue
             silent.append((path.name, bit))
         path.write_bytes(intact)
     assert silent == []
-    DatasetReader(made.root)
+    DatasetReader(version.root)
 
 
 @pytest.mark.physics
@@ -284,8 +284,8 @@ def test_no_swap_of_shards_of_one_size_is_silent(clips, tmp_path):
     """200 swaps: those that chance makes equal in size, and a sample's chunk that is put where
     another's was.
     """
-    made = clips.copy(tmp_path / "v1")
-    shards = [made.root / file.path for file in made.manifest.files if "/c/" in file.path]
+    version = clips.copy(tmp_path / "v1")
+    shards = [version.root / file.path for file in version.manifest.files if "/c/" in file.path]
     content = {path: path.read_bytes() for path in shards}
     pairs = [(a, b) for a in shards for b in shards if a < b and content[a] != content[b]]
     pairs = [(a, b) for a, b in pairs if len(content[a]) == len(content[b])]
@@ -295,7 +295,7 @@ def test_no_swap_of_shards_of_one_size_is_silent(clips, tmp_path):
         a, b = pairs[place]
         a.write_bytes(content[b])
         b.write_bytes(content[a])
-        silent += not (is_told(made.root, a) and is_told(made.root, b))
+        silent += not (is_told(version.root, a) and is_told(version.root, b))
         a.write_bytes(content[a])
         b.write_bytes(content[b])
     assert len({path for pair in pairs for path in pair}) > 10
@@ -306,48 +306,48 @@ def test_a_sample_that_changed_its_place_in_a_shard_raises(clips, tmp_path):
     """Every chunk has its checksum, and the file its size: only the manifest knows whose chunk it
     was.
     """
-    made = clips.copy(tmp_path / "v1")
-    path = made.root / "video/c/0/0/0/0/0"
+    version = clips.copy(tmp_path / "v1")
+    path = version.root / "video/c/0/0/0/0/0"
     data, index = path.read_bytes(), -(16 * 8 + 4)
     places = np.frombuffer(data[index:-4], dtype="<u8").reshape(8, 2).copy()
     places[[0, 1]] = places[[1, 0]]
     body = data[:index] + places.tobytes()
     path.write_bytes(body + google_crc32c.value(places.tobytes()).to_bytes(4, "little"))
-    swapped = DatasetReader(made.root, check_shards=False)
-    assert np.array_equal(swapped.read("video", [0]), made.arrays["video"][[1]])
+    swapped = DatasetReader(version.root, check_shards=False)
+    assert np.array_equal(swapped.read("video", [0]), version.arrays["video"][[1]])
     with pytest.raises(CorruptDataError, match=r"video/c/0/0/0/0/0 has SHA-256"):
-        DatasetReader(made.root).read("video", [0])
+        DatasetReader(version.root).read("video", [0])
 
 
 def test_a_version_without_its_seal_is_refused(clips, tmp_path):
-    made = clips.copy(tmp_path / "v1")
-    (made.root / "manifest.sha256").unlink()
+    version = clips.copy(tmp_path / "v1")
+    (version.root / "manifest.sha256").unlink()
     with pytest.raises(MissingFileError, match=r"manifest.sha256 is not there"):
-        DatasetReader(made.root)
+        DatasetReader(version.root)
 
 
 def test_each_of_the_three_is_checked(clips, tmp_path):
-    made = clips.copy(tmp_path / "v1")
-    group, seal_of = made.root / "zarr.json", made.root / "manifest.sha256"
+    version = clips.copy(tmp_path / "v1")
+    group, seal_of = version.root / "zarr.json", version.root / "manifest.sha256"
     other = sha256(b"other")
     group.write_text(
-        group.read_text().replace(sha256((made.root / "manifest.json").read_bytes()), other)
+        group.read_text().replace(sha256((version.root / "manifest.json").read_bytes()), other)
     )
     with pytest.raises(CorruptDataError, match=r"zarr.json has SHA-256"):
-        DatasetReader(made.root)
+        DatasetReader(version.root)
     lines = [
-        f"{sha256((made.root / name).read_bytes())}  {name}\n"
+        f"{sha256((version.root / name).read_bytes())}  {name}\n"
         for name in ("manifest.json", "zarr.json")
     ]
     seal_of.write_text("".join(lines))
     with pytest.raises(
         CorruptDataError, match=f"manifest_sha256 must be that of manifest.json, .*, and is {other}"
     ):
-        DatasetReader(made.root)
-    made.seal()
+        DatasetReader(version.root)
+    version.seal()
     seal_of.write_text("".join(lines) + "\n")
     with pytest.raises(CorruptDataError, match=r"manifest.sha256"):
-        DatasetReader(made.root)
+        DatasetReader(version.root)
 
 
 # --- contradictions
@@ -355,11 +355,11 @@ def test_each_of_the_three_is_checked(clips, tmp_path):
 
 
 def test_the_manifest_must_be_one(clips, tmp_path):
-    made = clips.copy(tmp_path / "v1")
-    (made.root / "manifest.json").write_text("{}")
-    made.seal()
+    version = clips.copy(tmp_path / "v1")
+    (version.root / "manifest.json").write_text("{}")
+    version.seal()
     with pytest.raises(InvalidDatasetError, match="the manifest does not hold to the contract"):
-        DatasetReader(made.root)
+        DatasetReader(version.root)
 
 
 @pytest.mark.parametrize(
@@ -375,34 +375,34 @@ def test_the_manifest_must_be_one(clips, tmp_path):
     ],
 )
 def test_the_manifest_must_not_contradict_itself_or_the_arrays(clips, tmp_path, changes, message):
-    made = clips.copy(tmp_path / "v1")
-    made.edit_manifest(**changes)
+    version = clips.copy(tmp_path / "v1")
+    version.edit_manifest(**changes)
     with pytest.raises(InvalidDatasetError, match=message):
-        DatasetReader(made.root)
+        DatasetReader(version.root)
 
 
 def test_the_manifest_of_another_dataset_is_refused(clips, rods, tmp_path):
-    made = clips.copy(tmp_path / "v1")
-    (made.root / "manifest.json").write_text(rods.manifest.model_dump_json())
+    version = clips.copy(tmp_path / "v1")
+    (version.root / "manifest.json").write_text(rods.manifest.model_dump_json())
     with pytest.raises(
         CorruptDataError, match=r"manifest.json has SHA-256 .*, and manifest.sha256 says"
     ):
-        DatasetReader(made.root)
-    shutil.copy(rods.root / "manifest.sha256", made.root)
+        DatasetReader(version.root)
+    shutil.copy(rods.root / "manifest.sha256", version.root)
     with pytest.raises(
         CorruptDataError, match=r"zarr.json has SHA-256 .*, and manifest.sha256 says"
     ):
-        DatasetReader(made.root)
+        DatasetReader(version.root)
 
 
 def test_sample_keys_must_be_those_of_the_manifest(clips, tmp_path):
-    made = clips.copy(tmp_path / "v1")
-    keys = made.manifest.sample_keys
-    made.edit_manifest(sample_keys=(keys[1], keys[0], *keys[2:]))
+    version = clips.copy(tmp_path / "v1")
+    keys = version.manifest.sample_keys
+    version.edit_manifest(sample_keys=(keys[1], keys[0], *keys[2:]))
     with pytest.raises(
         InvalidDatasetError, match=r"sample_key is not what the manifest says of samples \[0, 1\]"
     ):
-        DatasetReader(made.root)
+        DatasetReader(version.root)
 
 
 @pytest.mark.parametrize(
@@ -422,38 +422,40 @@ def test_sample_keys_must_be_those_of_the_manifest(clips, tmp_path):
     ],
 )
 def test_metadata_must_be_those_of_the_contract(clips, tmp_path, old, new, message):
-    made = clips.copy(tmp_path / "v1")
-    text = (made.root / "zarr.json").read_text()
+    version = clips.copy(tmp_path / "v1")
+    text = (version.root / "zarr.json").read_text()
     assert old in text
-    made.rewrite("zarr.json", text.replace(old, new).encode())
+    version.rewrite("zarr.json", text.replace(old, new).encode())
     with pytest.raises(InvalidDatasetError, match=message):
-        DatasetReader(made.root)
+        DatasetReader(version.root)
 
 
 def test_metadata_must_say_the_order_of_bytes_of_a_number(clips, tmp_path):
-    made = clips.copy(tmp_path / "v1")
-    group = json.loads((made.root / "zarr.json").read_text())
+    version = clips.copy(tmp_path / "v1")
+    group = json.loads((version.root / "zarr.json").read_text())
     (order,) = [
         codec
         for codec in group["consolidated_metadata"]["metadata"]["texture"]["codecs"]
         if "bytes" in codec.values()
     ]
     del order["configuration"]["endian"]
-    made.rewrite("zarr.json", json.dumps(group).encode())
+    version.rewrite("zarr.json", json.dumps(group).encode())
     with pytest.raises(InvalidDatasetError, match="array texture: codecs must be"):
-        DatasetReader(made.root)
+        DatasetReader(version.root)
 
 
 def test_metadata_need_not_be_consolidated(clips, tmp_path):
-    made = clips.copy(tmp_path / "v1")
-    made.rewrite("zarr.json", b'{"zarr_format": 3, "node_type": "group", "attributes": {}}')
-    assert np.array_equal(DatasetReader(made.root).read("video", [4]), made.arrays["video"][[4]])
+    version = clips.copy(tmp_path / "v1")
+    version.rewrite("zarr.json", b'{"zarr_format": 3, "node_type": "group", "attributes": {}}')
+    assert np.array_equal(
+        DatasetReader(version.root).read("video", [4]), version.arrays["video"][[4]]
+    )
 
 
 def test_a_manifest_cannot_lead_out_of_the_dataset(clips, tmp_path):
-    made = clips.copy(tmp_path / "v1")
-    entry = made.manifest.files[0].model_copy(update={"path": "video/../../secret"})
-    made.edit_manifest(files=(*made.manifest.files, entry))
+    version = clips.copy(tmp_path / "v1")
+    entry = version.manifest.files[0].model_copy(update={"path": "video/../../secret"})
+    version.edit_manifest(files=(*version.manifest.files, entry))
     Path(tmp_path, "secret").write_bytes(b"")
     with pytest.raises(InvalidDatasetError, match="which is not inside the dataset"):
-        DatasetReader(made.root, verify=True)
+        DatasetReader(version.root, verify=True)

@@ -89,10 +89,10 @@ def test_a_clip_with_its_mesh(clips):
 
 
 def test_a_dataset_without_meshes_says_so(make_clips):
-    made = make_clips(store_positions=False)
-    assert Samples(made.root)[1]["video"].shape == (2, 224, 224, 3)
+    version = make_clips(store_positions=False)
+    assert Samples(version.root)[1]["video"].shape == (2, 224, 224, 3)
     with pytest.raises(ValueError, match="the dataset has no array positions; it has video"):
-        Samples(made.root, arrays=["video", "positions"])
+        Samples(version.root, arrays=["video", "positions"])
 
 
 def test_a_batch_is_its_items(clips):
@@ -170,9 +170,9 @@ def test_workers_read_what_one_process_reads(clips, method):
 def test_an_error_in_a_worker_arrives_as_itself(clips, tmp_path):
     from stickslip_training.data.sources import MissingFileError
 
-    made = clips.copy(tmp_path / "v1")
-    dataset = Samples(made.root)
-    (made.root / "video/c/1/0/0/0/0").unlink()
+    version = clips.copy(tmp_path / "v1")
+    dataset = Samples(version.root)
+    (version.root / "video/c/1/0/0/0/0").unlink()
     with pytest.raises(MissingFileError, match="is not there, and the manifest says it is"):
         list(dataset.loader(12, num_workers=1))  # one batch: none is left behind in a queue
 

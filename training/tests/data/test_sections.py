@@ -24,20 +24,20 @@ from stickslip_training.data.sources import (
 )
 
 
-def write_sections(made, **changes):
+def write_sections(version, **changes):
     """Move what the manifest of a dataset lists of samples into sections.
 
     `changes` are of the second one.
     """
-    manifest = made.manifest
+    manifest = version.manifest
     size = section_samples(manifest.spec)
-    labels = {name for name, array in DatasetReader(made.root).arrays.items() if array.is_label}
+    labels = {name for name, array in DatasetReader(version.root).arrays.items() if array.is_label}
     shards = [
         file
         for file in manifest.files
         if "/c/" in file.path and file.path.split("/")[0] not in labels
     ]
-    (made.root / "manifest").mkdir()
+    (version.root / "manifest").mkdir()
     entries = []
     for number, first in enumerate(range(0, manifest.sample_count, size)):
         within = range(
@@ -55,16 +55,16 @@ def write_sections(made, **changes):
         if number == 1:
             section = section.model_copy(update=changes)
         data = canonical_json(section.model_dump(mode="json")).encode()
-        (made.root / section_path(number)).write_bytes(data)
+        (version.root / section_path(number)).write_bytes(data)
         entries.append(FileEntry(path=section_path(number), sha256=sha256(data), size=len(data)))
-    made.edit_manifest(
+    version.edit_manifest(
         sections=tuple(entries),
         files=tuple(file for file in manifest.files if file not in shards),
         sample_keys=(),
         rejections=(),
         rejection_counts={"out_of_frame": len(manifest.rejections)},
     )
-    return made
+    return version
 
 
 @pytest.fixture(autouse=True)
@@ -151,8 +151,8 @@ def test_no_flipped_bit_of_a_section_is_silent(sectioned):
     ],
 )
 def test_a_section_must_fit_the_labels(clips, tmp_path, changes, error, message):
-    made = write_sections(clips.copy(tmp_path / "v1"), **changes)
-    reader = DatasetReader(made.root)
+    version = write_sections(clips.copy(tmp_path / "v1"), **changes)
+    reader = DatasetReader(version.root)
     reader.read("mu", [0])
     with pytest.raises(error, match=message):
         reader.read("mu", [8])

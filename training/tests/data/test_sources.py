@@ -277,9 +277,9 @@ def test_a_short_answer_is_refused(server):
 
 
 def test_a_missing_or_shorter_shard_raises(server, seen_rods, tmp_path):
-    made = seen_rods.copy(tmp_path / "v1")
-    server.root = made.root
-    path = made.root / "views/c/1/0/0/0/0"
+    version = seen_rods.copy(tmp_path / "v1")
+    server.root = version.root
+    path = version.root / "views/c/1/0/0/0/0"
     with DatasetReader(_url(server)) as reader:
         path.write_bytes(path.read_bytes()[:-100])
         with pytest.raises(CorruptDataError):

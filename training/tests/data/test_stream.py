@@ -10,12 +10,12 @@ from stickslip_training.data.samples import Samples, Stream
 
 
 def slots(stream: Stream, count: int | None = None) -> list[list[int]]:
-    found = []
+    slots_of_batches = []
     for batch in stream:
-        found.append(batch["slot"].tolist())
-        if len(found) == count:
+        slots_of_batches.append(batch["slot"].tolist())
+        if len(slots_of_batches) == count:
             break
-    return found
+    return slots_of_batches
 
 
 def flat(batches) -> list[int]:
@@ -61,7 +61,7 @@ def test_processes_share_the_rounds(samples):
     assert {len(part) for part in parts} == {len(samples) // 6}
     rounds = [flat(batches) for batches in zip(*parts, strict=True)]
     assert len(set(flat(rounds))) == 6 * (len(samples) // 6)
-    assert rounds == [one for one in slots(Stream(samples, 6, seed=3)) if len(one) == 6]
+    assert rounds == [batch for batch in slots(Stream(samples, 6, seed=3)) if len(batch) == 6]
     half_way = Stream(samples, 2, seed=3, rank=1, world_size=3)
     slots(half_way, 1)
     alone = Stream(samples, 6, seed=3)

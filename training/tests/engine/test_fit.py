@@ -83,11 +83,11 @@ def test_resume_equals_uninterrupted_to_the_bit(tmp_path, stop):
     resumed = fit(Line(), SETTINGS, out=tmp_path / "stopped", resume=True)
     assert equal(resumed.net, straight.net)
     assert resumed.run.best_step == straight.run.best_step
-    told = [
+    lines = [
         [(report.step, report.train_loss, report.validation_loss) for report in fitted.run.history]
         for fitted in (straight, resumed)
     ]
-    assert told[0] == told[1]
+    assert lines[0] == lines[1]
     ends = [load_tensors(tmp_path / name / "checkpoint.pt") for name in ("straight", "stopped")]
     assert all(torch.equal(ends[0]["net"][name], ends[1]["net"][name]) for name in ends[0]["net"])
 

@@ -28,32 +28,32 @@ def test_masks_are_read_back_by_pycocotools(sized_clips: Any, tmp_path: Path) ->
     target = tmp_path / "out"
     done = run(app, ["export", str(sized_clips.root), "--coco", str(target)])
     assert done.exit_code == 0, done.output
-    seen = set()
+    categories = set()
     for path in sorted((target / "annotations").glob("instances_*.json")):
         split = path.stem.removeprefix("instances_")
-        found = pycocotools.COCO(str(path))
-        assert {entry["id"]: entry["name"] for entry in found.loadCats(found.getCatIds())} == THINGS
-        for image in found.loadImgs(found.getImgIds()):
+        index = pycocotools.COCO(str(path))
+        assert {entry["id"]: entry["name"] for entry in index.loadCats(index.getCatIds())} == THINGS
+        for image in index.loadImgs(index.getImgIds()):
             slot, frame = image["slot"], image["frame"]
-            seen.add((slot, frame))
+            categories.add((slot, frame))
             width, height = _sizes(sized_clips)[slot]
             assert (image["width"], image["height"]) == (width, height)
             codes = sized_clips.arrays["segmentation"][slot, frame, :height, :width]
-            entries = found.loadAnns(found.getAnnIds(image["id"]))
+            entries = index.loadAnns(index.getAnnIds(image["id"]))
             assert {entry["category_id"] for entry in entries} == set(THINGS)
             for entry in entries:
-                mask = found.annToMask(entry).astype(bool)
+                mask = index.annToMask(entry).astype(bool)
                 assert np.array_equal(mask, codes == entry["category_id"])
                 assert entry["area"] == mask.sum()
                 from pycocotools import mask as library
 
-                assert library.toBbox(found.annToRLE(entry)).tolist() == entry["bbox"]
+                assert library.toBbox(index.annToRLE(entry)).tolist() == entry["bbox"]
             with Image.open(target / "images" / split / image["file_name"]) as picture:
-                shown = np.asarray(picture)
-            assert np.array_equal(shown, sized_clips.arrays["video"][slot, frame, :height, :width])
+                pixels = np.asarray(picture)
+            assert np.array_equal(pixels, sized_clips.arrays["video"][slot, frame, :height, :width])
     valid = np.flatnonzero(sized_clips.arrays["valid"])
     frames = sized_clips.arrays["video"].shape[1]
-    assert seen == {(slot, frame) for slot in valid.tolist() for frame in range(frames)}
+    assert categories == {(slot, frame) for slot in valid.tolist() for frame in range(frames)}
     labels = [json.loads(line) for line in (target / "labels.jsonl").read_text().splitlines()]
     assert [label["slot"] for label in labels] == valid.tolist()
     assert not list((target / "annotations").glob("*.annotations"))
@@ -73,14 +73,14 @@ def test_a_sample_of_webdataset_has_its_masks(sized_clips: Any, tmp_path: Path) 
                 slot = int(member.name.split(".")[0])
                 file = tar.extractfile(member)
                 assert file is not None
-                found = pycocotools.COCO()
-                found.dataset = json.load(file)
-                found.createIndex()
+                index = pycocotools.COCO()
+                index.dataset = json.load(file)
+                index.createIndex()
                 width, height = _sizes(sized_clips)[slot]
                 codes = sized_clips.arrays["segmentation"][slot, :, :height, :width]
-                for entry in found.loadAnns(found.getAnnIds()):
+                for entry in index.loadAnns(index.getAnnIds()):
                     wanted = codes[entry["image_id"]] == entry["category_id"]
-                    assert np.array_equal(found.annToMask(entry).astype(bool), wanted)
+                    assert np.array_equal(index.annToMask(entry).astype(bool), wanted)
                     checked += 1
     assert checked == 3 * sized_clips.arrays["video"].shape[1] * sized_clips.arrays["valid"].sum()
 

@@ -48,13 +48,13 @@ def expected(source: Any) -> dict[str, np.ndarray]:
     }
 
 
-def same(found: Any, wanted: np.ndarray) -> bool:
+def same(exported: Any, wanted: np.ndarray) -> bool:
     """Return whether two arrays have the same type, shape and bits."""
-    found = np.asarray(found)
+    exported = np.asarray(exported)
     return (
-        found.dtype == wanted.dtype
-        and found.shape == wanted.shape
-        and found.tobytes() == wanted.tobytes()
+        exported.dtype == wanted.dtype
+        and exported.shape == wanted.shape
+        and exported.tobytes() == wanted.tobytes()
     )
 
 
@@ -108,7 +108,7 @@ def test_webdataset_is_the_source(
     export(source, "--webdataset", target)
     arrays = {array.name: array for array in layout(source.spec)} | {"slot": content_module.SLOT}
     wanted = expected(source)
-    found: dict[str, list[Any]] = {name: [] for name in wanted}
+    exported: dict[str, list[Any]] = {name: [] for name in wanted}
     for code, split in enumerate(SPLITS):
         tars = sorted(map(str, target.glob(f"{split}-*.tar")))
         assert len(tars) == -(-int((wanted["split"] == code).sum()) // 2)
@@ -117,16 +117,16 @@ def test_webdataset_is_the_source(
             assert int(item["__key__"]) == item["json"]["slot"]
             for name in wanted:
                 value = item["json"][name] if name in item["json"] else item[f"{name}.npy"]
-                found[name].append(value)
+                exported[name].append(value)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ResourceWarning)  # webdataset closes no file
         gc.collect()
-    order = np.argsort(found["slot"])
+    order = np.argsort(exported["slot"])
     for name, values in wanted.items():
         if arrays[name].is_label and values.dtype.kind == "f":
             # A label that is not finite is null in JSON, whatever it was.
             values = np.where(np.isfinite(values), values, np.nan)
-        assert same(np.array(found[name], dtype=arrays[name].dtype)[order], values), name
+        assert same(np.array(exported[name], dtype=arrays[name].dtype)[order], values), name
         if f"{name}.npy" in item:
             assert item[f"{name}.npy"].dtype == values.dtype
     described = json.loads((target / "dataset.json").read_bytes())
@@ -152,15 +152,15 @@ def test_huggingface_is_the_source(
     wanted = expected(source)
     arrays = {array.name: array for array in layout(source.spec)}
     for code, split in enumerate(SPLITS):
-        own = wanted["split"] == code
-        if not own.any():
+        is_of_split = wanted["split"] == code
+        if not is_of_split.any():
             assert split not in loaded
             continue
         rows = loaded[split]
         assert set(rows.column_names) == set(wanted)
         for name, values in wanted.items():
             column = rows.select_columns(name).with_format("numpy", dtype=values.dtype)[:][name]
-            assert same(np.stack(list(column)), values[own]), name
+            assert same(np.stack(list(column)), values[is_of_split]), name
             if name != "slot" and arrays[name].categories:
                 assert rows.features[name].names == list(map(str, arrays[name].categories))
 

@@ -94,7 +94,7 @@ def content(
         categories=lambda name: arrays[name].categories,
         label=lambda name: data[name],
     )
-    made = SimpleNamespace(
+    source = SimpleNamespace(
         arrays=layouts,
         labels=tuple(layout for layout in layouts if layout.is_label),
         slots=np.array([slot for slot in range(count) if slot not in without]),
@@ -105,14 +105,14 @@ def content(
         read=lambda name, slots: data[name][slots],
         picture=lambda name, slot: data[name][slot],
     )
-    return made, data
+    return source, data
 
 
 def test_an_episode_has_all_views_and_comes_with_its_split(tmp_path: Path) -> None:
     pytest.importorskip("pandas", reason="pandas is not installed: make setup-dev")
     parquet = pytest.importorskip("pyarrow.parquet")
-    made, data = content(without=(3,))  # the second simulation lacks a view
-    lerobot.write(made, tmp_path, lambda _: None)
+    source, data = content(without=(3,))  # the second simulation lacks a view
+    lerobot.write(source, tmp_path, lambda _: None)
     episodes = parquet.read_table(tmp_path / "meta/episodes/chunk-000/file-000.parquet").to_pydict()
     assert episodes["mu"] == data["mu"][[0, 6, 4]].tolist()  # train, train, test
     assert episodes["fabric"] == ["wool", "silk", "wool"]
@@ -120,15 +120,15 @@ def test_an_episode_has_all_views_and_comes_with_its_split(tmp_path: Path) -> No
     assert info["splits"] == {"train": "0:2", "test": "2:3"}
     assert info["total_frames"] == 3 * FRAMES
     rows = parquet.read_table(tmp_path / "data/chunk-000/file-000.parquet").to_pydict()
-    instants = made.arrays[1].attributes["instants"]
+    instants = source.arrays[1].attributes["instants"]
     pose, grasped = data["holder_pose"][0][instants], data["grasped"][0][instants]
-    own = np.concatenate(
+    of_clips = np.concatenate(
         [pose[..., 3], pose[..., 0], pose[..., 1], grasped[..., None]], axis=-1
     ).reshape(FRAMES, -1)
     state, action = np.array(rows["observation.state"][:FRAMES]), np.array(rows["action"][:FRAMES])
-    np.testing.assert_array_equal(state[:, :20], own)
-    np.testing.assert_array_equal(action[:-1], own[1:])
-    np.testing.assert_array_equal(action[-1], own[-1])
+    np.testing.assert_array_equal(state[:, :20], of_clips)
+    np.testing.assert_array_equal(action[:-1], of_clips[1:])
+    np.testing.assert_array_equal(action[-1], of_clips[-1])
     corners = data["napkin.positions"][0][instants][:, [0, 20, 24, 4, 12]].reshape(FRAMES, -1)
     np.testing.assert_array_equal(state[:, -15:], corners)
     names = info["features"]["observation.state"]["names"]
@@ -142,17 +142,17 @@ def test_an_episode_has_all_views_and_comes_with_its_split(tmp_path: Path) -> No
     every = np.array(rows["action"])
     np.testing.assert_allclose(stats["action"]["mean"], every.mean(axis=0), atol=1e-12)
     np.testing.assert_allclose(stats["action"]["std"], every.std(axis=0), atol=1e-12)
-    shown = data["video"][[0, 6, 4]].reshape(-1, 3) / 255.0  # by the camera `front`
+    pixels = data["video"][[0, 6, 4]].reshape(-1, 3) / 255.0  # by the camera `front`
     pictures = stats["observation.images.front"]
-    assert pictures["count"] == [len(shown)]
-    for name, expected in (("mean", shown.mean(axis=0)), ("std", shown.std(axis=0))):
+    assert pictures["count"] == [len(pixels)]
+    for name, expected in (("mean", pixels.mean(axis=0)), ("std", pixels.std(axis=0))):
         np.testing.assert_allclose(np.ravel(pictures[name]), expected, atol=1e-9)
 
 
 def test_videos_have_the_bytes_of_the_clips(tmp_path: Path) -> None:
     av = pytest.importorskip("av", reason="av is not installed: make setup-dev")
-    made, data = content(1)
-    lerobot.write(made, tmp_path, lambda _: None)
+    source, data = content(1)
+    lerobot.write(source, tmp_path, lambda _: None)
     for slot, view in enumerate(VIEWS):
         path = tmp_path / f"videos/observation.images.{view}/chunk-000/file-000.mp4"
         with av.open(str(path)) as file:
@@ -163,8 +163,8 @@ def test_videos_have_the_bytes_of_the_clips(tmp_path: Path) -> None:
 def test_depth_is_a_feature_in_twelve_bits(tmp_path: Path) -> None:
     """As lerobot 0.6 reads it: from codes and the numbers beside them, to half a step."""
     av = pytest.importorskip("av", reason="av is not installed: make setup-dev")
-    made, data = content(1, has_depth=True)
-    lerobot.write(made, tmp_path, lambda _: None)
+    source, data = content(1, has_depth=True)
+    lerobot.write(source, tmp_path, lambda _: None)
     info = json.loads((tmp_path / "meta/info.json").read_text())
     stats = json.loads((tmp_path / "meta/stats.json").read_text())
     for slot, view in enumerate(VIEWS):
@@ -200,10 +200,10 @@ def test_depth_is_a_feature_in_twelve_bits(tmp_path: Path) -> None:
 def test_what_is_no_episode_is_refused(
     tmp_path: Path, change: dict[str, Any], message: str
 ) -> None:
-    made, _ = content(2)
-    vars(made).update(change)
+    source, _ = content(2)
+    vars(source).update(change)
     with pytest.raises(ValueError, match=message):
-        lerobot.write(made, tmp_path, lambda _: None)
+        lerobot.write(source, tmp_path, lambda _: None)
 
 
 FRAME_COLUMNS = {
@@ -251,8 +251,8 @@ INFO_KEYS = {
 def test_files_have_the_layout_of_version_3(tmp_path: Path) -> None:
     pytest.importorskip("pandas", reason="pandas is not installed: make setup-dev")
     parquet = pytest.importorskip("pyarrow.parquet")
-    made, _ = content(6)
-    lerobot.write(made, tmp_path, lambda _: None)
+    source, _ = content(6)
+    lerobot.write(source, tmp_path, lambda _: None)
     info = json.loads((tmp_path / "meta/info.json").read_text(), parse_constant=pytest.fail)
     assert info.keys() == INFO_KEYS
     assert info["codebase_version"] == "v3.0"
@@ -286,8 +286,8 @@ def test_files_have_the_layout_of_version_3(tmp_path: Path) -> None:
 
 def test_a_frame_of_a_video_is_at_its_time(tmp_path: Path) -> None:
     av = pytest.importorskip("av", reason="av is not installed: make setup-dev")
-    made, _ = content(3)
-    lerobot.write(made, tmp_path, lambda _: None)
+    source, _ = content(3)
+    lerobot.write(source, tmp_path, lambda _: None)
     info = json.loads((tmp_path / "meta/info.json").read_text())
     for episode in range(3):
         path = info["video_path"].format(

@@ -70,8 +70,8 @@ def picture(share, *, color=COLOR, noise=0.0, seed=0, vignette=0.0):
     return np.rint(255 * encoded.clip(0, 1)).astype(np.uint8)
 
 
-def mean_error(found, line):
-    return float(np.linalg.norm(found - line, axis=1).mean())
+def mean_error(curve, line):
+    return float(np.linalg.norm(curve - line, axis=1).mean())
 
 
 @pytest.fixture(scope="module")
@@ -84,17 +84,17 @@ def tight():
 @pytest.mark.slow
 def test_a_curl_that_crosses_itself_in_views_is_found_to_a_thousandth(tight):
     line, shares = tight
-    found = reconstruct([picture(share) for share in shares], RIG)
-    assert mean_error(found.centerline, line) < 1e-3
-    assert found.verdict == Verdict.good, found.reasons
-    assert found.centerline.shape == (150, 3)
-    assert found.radius == pytest.approx(RADIUS, rel=0.05)
-    steps = np.linalg.norm(np.diff(found.centerline, axis=0), axis=1)
+    result = reconstruct([picture(share) for share in shares], RIG)
+    assert mean_error(result.centerline, line) < 1e-3
+    assert result.verdict == Verdict.good, result.reasons
+    assert result.centerline.shape == (150, 3)
+    assert result.radius == pytest.approx(RADIUS, rel=0.05)
+    steps = np.linalg.norm(np.diff(result.centerline, axis=0), axis=1)
     np.testing.assert_allclose(steps, steps.mean(), rtol=2e-3)
-    assert found.residual.shape == (4, 150)
-    assert found.residual_rms < 0.2
-    assert found.views_seen.min() >= 2
-    assert found.views_seen.max() == 4
+    assert result.residual.shape == (4, 150)
+    assert result.residual_rms < 0.2
+    assert result.views_seen.min() >= 2
+    assert result.views_seen.max() == 4
 
 
 @pytest.mark.slow
@@ -110,9 +110,9 @@ def test_noise_and_an_uneven_ground_cost_little():
         )
         for seed, camera in enumerate(RIG)
     ]
-    found = reconstruct(views, RIG, radius=RADIUS)
-    assert mean_error(found.centerline, line) < 2e-3
-    assert found.radius == pytest.approx(RADIUS)
+    result = reconstruct(views, RIG, radius=RADIUS)
+    assert mean_error(result.centerline, line) < 2e-3
+    assert result.radius == pytest.approx(RADIUS)
 
 
 @pytest.mark.slow
@@ -122,7 +122,7 @@ def test_units_clamp_and_large_pictures_of_the_user():
     cameras = []
     for camera in RIG:
         t = length * np.asarray(camera.translation) - np.asarray(camera.rotation) @ clamp
-        own = {
+        user_rig = {
             "width": 3 * 224,
             "height": 3 * 224,
             "fx": 3 * 620,
@@ -130,15 +130,15 @@ def test_units_clamp_and_large_pictures_of_the_user():
             "cx": 335.5,
             "cy": 335.5,
         }
-        cameras.append(Camera(**{**camera.model_dump(), **own, "translation": tuple(t)}))
+        cameras.append(Camera(**{**camera.model_dump(), **user_rig, "translation": tuple(t)}))
     world = clamp + length * line
     views = [picture(coverage(world, camera, length * RADIUS)) for camera in cameras]
-    found = reconstruct(views, cameras, length=length, clamp=clamp, points=100)
+    result = reconstruct(views, cameras, length=length, clamp=clamp, points=100)
     s = np.linspace(0, 1, 150)
     even = np.stack([np.interp(np.linspace(0, 1, 100), s, axis) for axis in world.T], axis=1)
-    assert mean_error(found.centerline, even) < 1e-3 * length
-    assert found.radius == pytest.approx(length * RADIUS, rel=0.05)
-    assert found.deviation.max() < 2e-3 * length
+    assert mean_error(result.centerline, even) < 1e-3 * length
+    assert result.radius == pytest.approx(length * RADIUS, rel=0.05)
+    assert result.deviation.max() < 2e-3 * length
 
 
 @pytest.mark.slow
@@ -146,10 +146,10 @@ def test_views_that_contradict_one_another_are_flagged(tight):
     _, shares = tight
     other = coverage(curl(2.0, 1.0), RIG[1])
     views = [picture(share) for share in (shares[0], other, shares[2], shares[3])]
-    found = reconstruct(views, RIG)
-    assert found.verdict == Verdict.failed
+    result = reconstruct(views, RIG)
+    assert result.verdict == Verdict.failed
     assert re.search(
-        r"(misfit|unexplained share|unsupported share) 0\.\d+ is above", " ".join(found.reasons)
+        r"(misfit|unexplained share|unsupported share) 0\.\d+ is above", " ".join(result.reasons)
     )
 
 
@@ -230,11 +230,11 @@ def test_the_command_writes_centreline_overlay_and_report(bench, tmp_path):
     assert result.exit_code == 0, result.output
     assert "good: misfit" in result.output
     table = np.genfromtxt(out / "centerline.csv", delimiter=",", names=True)
-    found = np.stack([table["x"], table["y"], table["z"]], axis=1)
-    assert mean_error(found, line) < 1e-3
+    curve = np.stack([table["x"], table["y"], table["z"]], axis=1)
+    assert mean_error(curve, line) < 1e-3
     assert table["arc_length"][-1] == 1.0
     with np.load(out / "centerline.npz") as file:
-        np.testing.assert_allclose(file["centerline"], found, atol=1e-8)
+        np.testing.assert_allclose(file["centerline"], curve, atol=1e-8)
     report = json.loads((out / "report.json").read_text())
     assert report["verdict"] == "good"
     assert set(report["residual_rms_px_by_view"]) == {"front", "side", "high", "low"}

@@ -69,10 +69,10 @@ def test_a_silhouette_has_the_area_of_the_strip_whatever_its_colour(color):
     share = strip()
     light = 0.002 + share[..., None] * np.array(color)
     encoded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
-    found = silhouette(to_linear(np.rint(255 * encoded).astype(np.uint8)))
+    coverage = silhouette(to_linear(np.rint(255 * encoded).astype(np.uint8)))
     rows = slice(8, -8)  # at the frame the brightness about a pixel is one-sided
-    np.testing.assert_allclose(found[rows].sum(axis=1), share[rows].sum(axis=1), rtol=0.12)
-    middle = (found[rows] * np.arange(64)).sum(axis=1) / found[rows].sum(axis=1)
+    np.testing.assert_allclose(coverage[rows].sum(axis=1), share[rows].sum(axis=1), rtol=0.12)
+    middle = (coverage[rows] * np.arange(64)).sum(axis=1) / coverage[rows].sum(axis=1)
     np.testing.assert_allclose(middle, 30.0 + 0.3 * (np.arange(8, 56) - 32), atol=0.05)
 
 
@@ -116,9 +116,9 @@ def test_views_project_as_cameras_do(line):
 
 def test_a_spline_is_at_uniform_arc_length(line):
     control = fit_curve(line, 44)
-    found = at_uniform_arc_length(control, 150)
-    assert np.linalg.norm(found - line, axis=1).max() < 2e-4
-    steps = np.linalg.norm(np.diff(found, axis=0), axis=1)
+    points = at_uniform_arc_length(control, 150)
+    assert np.linalg.norm(points - line, axis=1).max() < 2e-4
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     np.testing.assert_allclose(steps, steps.mean(), rtol=1e-3)
 
 

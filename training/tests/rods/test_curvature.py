@@ -155,9 +155,11 @@ def test_an_empty_split_is_made_up_for_and_told(make_rods, tmp_path):
     axes = {"gamma": [200.0, 400.0, 800.0], "phi0": [1.0, 3.0], "phi1": 8.0}
 
     def run(name, **splits):
-        made = make_rods(axes=axes, splits={"train": 0.0, "validation": 0.0, "test": 0.0} | splits)
+        version = make_rods(
+            axes=axes, splits={"train": 0.0, "validation": 0.0, "test": 0.0} | splits
+        )
         return train_curvature(
-            CurvatureTraining(dataset=str(made.root), out=tmp_path / name, steps=1, threads=1)
+            CurvatureTraining(dataset=str(version.root), out=tmp_path / name, steps=1, threads=1)
         )
 
     only_train = run("train", train=1.0)

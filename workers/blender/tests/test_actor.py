@@ -277,27 +277,31 @@ def test_every_function_that_renders_is_in_the_build(
     }
     for kind, (first, task) in tasks.items():
         actor.render(first)  # to import, and to close the renderer of the other kind, is no work
-        ran: set[str] = set()
+        called: set[str] = set()
         sys.setprofile(
-            lambda frame, event, _, ran=ran: (
-                ran.add(frame.f_code.co_filename) if event == "call" else None
+            lambda frame, event, _, called=called: (
+                called.add(frame.f_code.co_filename) if event == "call" else None
             )
         )
         actor.render(task)
         sys.setprofile(None)
-        ours = {
-            Path(name).resolve() for name in ran if "/stickslip_" in name and name.endswith(".py")
+        source_files = {
+            Path(name).resolve()
+            for name in called
+            if "/stickslip_" in name and name.endswith(".py")
         }
         built = {path.resolve() for path in sources(roots(kind), cut=UNCOUNTED).values()}
-        documents = {path for path in ours if path.as_posix().endswith(DOCUMENTS)}
+        documents = {path for path in source_files if path.as_posix().endswith(DOCUMENTS)}
         uncounted = {
             path
-            for path in ours
+            for path in source_files
             if path.parts[-3:] == ("stickslip_schemas", "kinds", "__init__.py")
         }
-        uncounted |= {path for path in ours if path.parts[-3:-1] == ("stickslip_schemas", "store")}
-        assert len(ours) > 8
-        assert ours - uncounted - documents <= built, ours - built
+        uncounted |= {
+            path for path in source_files if path.parts[-3:-1] == ("stickslip_schemas", "store")
+        }
+        assert len(source_files) > 8
+        assert source_files - uncounted - documents <= built, source_files - built
 
 
 def test_a_clip_has_the_same_bytes_however_its_shading_was_made(

@@ -28,7 +28,7 @@ JOB_SECONDS = 2.0
 """Wall time of a job beside its tasks [s]: leases, and waits of one stage for another."""
 
 UNCERTAINTY_FACTOR = 1.6
-"""80 % of renders, packs and publishes take within this factor of their usual time."""
+"""80 % of packs and publishes take within this factor of their usual time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,7 +210,7 @@ def _packaged_costs(
     publish = PUBLISH_SECONDS + counts.shards * PUBLISH_SHARD_SECONDS
     seconds = {
         Stage.simulate: (simulate, costs.uncertainty_factor),
-        Stage.render: (render, UNCERTAINTY_FACTOR),
+        Stage.render: (render, costs.render_factor),
         Stage.pack: (counts.sample_count * costs.pack, UNCERTAINTY_FACTOR),
         Stage.publish: (publish, UNCERTAINTY_FACTOR),
     }

@@ -195,6 +195,9 @@ class Costs(NamedTuple):
     uncertainty_factor: float = 2.0
     """80 % of simulations take within this factor of `simulate`."""
 
+    render_factor: float = 1.6
+    """80 % of renders take within this factor of their usual time."""
+
 
 class JobSpec(Document):
     """Base of the specs of all kinds, with all that common code may ask a spec.

@@ -6,9 +6,10 @@ rod until the *hung* rod of the forward model (`hung_rod`) meets the centreline.
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.rods.clamp import refuse_other_clamp
@@ -286,62 +287,118 @@ def fit_natural_curvature(
     uniform = _fit_constant(constant, data, gamma, None, components=(0, 1, 2))
     model = HungRodModel.of(len(data), stiffness, INTERVALS, clamp_frame)
     coefficients = np.tile(uniform.coefficients, (INTERVALS + 3, 1))
-    state = model.relax(uniform.gamma, coefficients, uniform.frames)
-    assert state is not None  # the same rod as before
+    start = model.relax(uniform.gamma, coefficients, uniform.frames)
+    assert start is not None  # the same rod as before
 
-    # |D c|^2 as a matrix. The weight of smoothness is relative to the scale of the data.
-    free = np.arange(0 if gamma is None else 1, 1 + 3 * (INTERVALS + 3))
-    penalty = np.zeros((1 + 3 * (INTERVALS + 3),) * 2)
-    differences = np.diff(np.eye(INTERVALS + 3), axis=0)
-    penalty[1:, 1:] = np.kron(np.eye(3), differences.T @ differences)
-    jacobian = model.jacobian(state)
-    scale = np.trace(jacobian.T @ jacobian) / np.trace(penalty)
-    best: tuple[float, HungRod, float, float] | None = None
-
-    # The fit of each weight begins at the fit of the last weight, which is near.
-    for decade in PENALTY_DECADES:
-        weighted = 10.0**decade * scale * penalty
-        state = minimise(model, state, data, free, weighted, PATH_TOLERANCE)
-
-        # The effective degrees of freedom are the trace of the matrix that maps data to the fit.
-        jacobian = model.jacobian(state)[:, free]
-        normal = jacobian.T @ jacobian
-        used = float(
-            np.trace(np.linalg.solve(normal + weighted[np.ix_(free, free)] + ridge(normal), normal))
-        )
-        misfit = float((state.residual(data) ** 2).sum())
-        effective_size = data.size - 3 - DEGREES_FACTOR * used
-        if effective_size <= 0:
-            break
-        score = misfit / effective_size**2
-
-        # With the residual down at the noise, a smaller weight would fit the noise itself.
-        degrees_left = data.size - 3 - used
-        is_at_noise = noise is not None and misfit <= noise**2 * (
-            degrees_left + np.sqrt(2.0 * degrees_left)
-        )
-        if is_at_noise or best is None or score < best[0]:
-            best = (score, state, used, float(decade))
-
-        # Stop well past the least score, since small rises may come before it.
-        if is_at_noise or score > 1.5 * best[0]:
-            break
-    assert best is not None  # the first weight leaves degrees of freedom
-
+    problem = _SmoothFit.of(model, data, start, is_gamma_fitted=gamma is None)
+    best = _search_weights(problem, start, noise)
     # Bring the chosen fit down to the tolerance of a result.
-    _, state, used, decade = best
-    state = minimise(model, state, data, free, 10.0**decade * scale * penalty, STEP_TOLERANCE)
-    misfit = float((state.residual(data) ** 2).sum())
+    state = problem.minimise(best.state, best.decade, STEP_TOLERANCE)
     samples = bspline_matrix(INTERVALS, np.linspace(0.0, 1.0, len(data))) @ state.coefficients
     return NaturalFit(
         samples,
         state.gamma,
         root_mean_square(state.residual(data)),
-        float(np.sqrt(misfit / (data.size - 3 - used))),
-        used,
-        float(10.0**decade),
+        float(np.sqrt(problem.misfit(state) / (problem.data_count - best.degrees_used))),
+        best.degrees_used,
+        float(10.0**best.decade),
         model.solution(state, len(data)),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _SmoothFit:
+    """The least squares of `fit_natural_curvature`, for any weight of smoothness."""
+
+    model: HungRodModel
+    data: Floats
+    free: NDArray[np.int_]
+    """Numbers of the fitted parameters: log gamma, if it is fitted, and all coefficients."""
+
+    penalty: Floats
+    """Matrix of |D c|^2."""
+
+    scale: float
+    """Weight of smoothness that weighs as much as the data."""
+
+    @classmethod
+    def of(
+        cls, model: HungRodModel, data: Floats, start: HungRod, *, is_gamma_fitted: bool
+    ) -> Self:
+        """Scale the weight of smoothness by the derivatives at a start."""
+        size = 1 + 3 * (INTERVALS + 3)
+        penalty = np.zeros((size, size))
+        differences = np.diff(np.eye(INTERVALS + 3), axis=0)
+        penalty[1:, 1:] = np.kron(np.eye(3), differences.T @ differences)
+        jacobian = model.jacobian(start)
+        scale = np.trace(jacobian.T @ jacobian) / np.trace(penalty)
+        free = np.arange(0 if is_gamma_fitted else 1, size)
+        return cls(model, data, free, penalty, float(scale))
+
+    @property
+    def data_count(self) -> int:
+        """Number of coordinates; the clamped point has no error, so its three are no data."""
+        return self.data.size - 3
+
+    def weighted_penalty(self, decade: float) -> Floats:
+        """Return the matrix of w |D c|^2, with w in decades."""
+        return np.asarray(10.0**decade * self.scale * self.penalty)
+
+    def minimise(self, state: HungRod, decade: float, tolerance: float) -> HungRod:
+        """Return the minimum for a weight, from a state nearby."""
+        weighted = self.weighted_penalty(decade)
+        return minimise(self.model, state, self.data, self.free, weighted, tolerance)
+
+    def misfit(self, state: HungRod) -> float:
+        """Return the sum of squared residuals [L^2]."""
+        return float((state.residual(self.data) ** 2).sum())
+
+    def degrees_used(self, state: HungRod, decade: float) -> float:
+        """Return the trace of the matrix that maps data to the fit."""
+        jacobian = self.model.jacobian(state)[:, self.free]
+        normal = jacobian.T @ jacobian
+        penalty = self.weighted_penalty(decade)[np.ix_(self.free, self.free)]
+        return float(np.trace(np.linalg.solve(normal + penalty + ridge(normal), normal)))
+
+
+class _WeightedFit(NamedTuple):
+    """The fit for one weight of smoothness."""
+
+    score: float
+    """Generalised cross validation; the least is the best."""
+
+    state: HungRod
+    degrees_used: float
+    decade: float
+
+
+def _search_weights(problem: _SmoothFit, start: HungRod, noise: float | None) -> _WeightedFit:
+    """Return the fit for the best weight of smoothness, or for the first at the noise."""
+    best: _WeightedFit | None = None
+    state = start
+    # The fit of each weight begins at the fit of the last weight, which is near.
+    for decade in PENALTY_DECADES:
+        state = problem.minimise(state, decade, PATH_TOLERANCE)
+        used = problem.degrees_used(state, decade)
+        misfit = problem.misfit(state)
+        effective_size = problem.data_count - DEGREES_FACTOR * used
+        if effective_size <= 0:
+            break
+        fit = _WeightedFit(misfit / effective_size**2, state, used, float(decade))
+
+        # With the residual down at the noise, a smaller weight would fit the noise itself.
+        degrees_left = problem.data_count - used
+        is_at_noise = noise is not None and misfit <= noise**2 * (
+            degrees_left + np.sqrt(2.0 * degrees_left)
+        )
+        if is_at_noise or best is None or fit.score < best.score:
+            best = fit
+
+        # Stop well past the least score, since small rises may come before it.
+        if is_at_noise or fit.score > 1.5 * best.score:
+            break
+    assert best is not None  # the first weight leaves degrees of freedom
+    return best
 
 
 def _fit_constant(

@@ -16,10 +16,11 @@ from stickslip_sim_core.cloth.meshes import Mesh
 from stickslip_sim_core.cloth.presets import SolverSettings
 from stickslip_sim_core.cloth.solver import Cloth
 from stickslip_sim_core.scenes.evenness import uneven_until
-from stickslip_sim_core.scenes.frames import frame_at
+from stickslip_sim_core.scenes.frames import Frame, frame_at
 from stickslip_sim_core.scenes.holders import Hands, Hanging, Holder
 from stickslip_sim_core.scenes.kind import IMPOSSIBLE_START, Array, Kind, OnFrame, Outcome, Record
 from stickslip_sim_core.scenes.sensitivities import (
+    AtFrame,
     Followed,
     SceneSensitivity,
     Sensitivity,
@@ -97,6 +98,47 @@ class Begun(NamedTuple):
     hands: Hands
     cloth: Cloth
     followed: Followed
+
+
+@dataclass(eq=False, slots=True)
+class _Frames:
+    """The frames of a run, while it runs."""
+
+    positions: list[Floats] = field(default_factory=list)
+    """Positions of the vertices at each frame: (V, 3) [m]."""
+
+    forces: list[Record] = field(default_factory=list)
+    """Arrays that `Scene.forces` returned at each frame."""
+
+    crossings: list[int] = field(default_factory=list)
+    """Number of pairs of triangles that cross at each frame."""
+
+    derivatives: list[AtFrame] = field(default_factory=list)
+    """Derivatives by the parameters at each frame."""
+
+    rest_time: float = np.nan
+    """Time at which everything came to rest and ended the scene [s], or NaN."""
+
+    def add(self, frame: Frame, forces: Record, derivatives: AtFrame) -> None:
+        """Append a frame."""
+        self.positions.append(frame.positions)
+        self.crossings.append(frame.crossings)
+        self.forces.append(forces)
+        self.derivatives.append(derivatives)
+
+    def repeat_last(self, count: int) -> None:
+        """Append the last frame `count` times."""
+        self.positions += count * self.positions[-1:]
+        self.crossings += count * self.crossings[-1:]
+        self.forces += count * self.forces[-1:]
+        self.derivatives += count * self.derivatives[-1:]
+
+    def record(self) -> Record:
+        """Return the recorded arrays with the frames as their first axis."""
+        record: dict[str, Array] = {}
+        for name in self.forces[0]:
+            record[name] = np.stack([forces[name] for forces in self.forces])
+        return record
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -211,56 +253,12 @@ class Scene:
         Raises:
             ValueError: The scene cannot begin.
         """
-        hands, cloth, followed = begin = self.begin() if begun is None else begun
-        first = frame_at(cloth, 0.0, lambda time: self.motion(time)[1])
-        paths = [first.positions]
-        forces = [self.forces(cloth)]
-        crossed = [first.crossings]
-        calm = 0
-        rest_time = np.nan
-        verdict = checks.Verdict(cloth)
-        derivatives = [followed.at_frame(first)]
-        # No run of a scene with a reason is valid, so it has its first frame alone.
-        for frame in range(1, 1 if self.reason else self.frames):
-            time = frame / self.frame_rate
-            self._advance(begin, time, verdict)
-            # A check has failed, or the budget is spent, and the cloth has not reached the frame.
-            if cloth.time < time:
-                break
-            now = frame_at(cloth, time, lambda time: self.motion(time)[1])
-            paths.append(now.positions)
-            derivatives.append(followed.at_frame(now))
-            crossed.append(now.crossings)
-            forces.append(self.forces(cloth))
-            if on_frame is not None:
-                on_frame(frame + 1, self.frames)
-            if verdict.see_frame(now.crossings if self.self_contact else 0):
-                break
-            calm = calm + 1 if self._is_still(time, paths[-2], paths[-1]) else 0
-            if calm >= REST_TIME * self.frame_rate:
-                rest_time = time
-                break
-        # A scene that has come to rest repeats its last frame. Every sample of the scene then has
-        # the same number of frames.
-        missing = 0 if np.isnan(rest_time) else self.frames - len(paths)
-        for frames in (paths, forces, crossed, derivatives):
-            frames += missing * frames[-1:]  # type: ignore[operator]
-        path = np.stack(paths)
+        begun = self.begin() if begun is None else begun
+        hands, cloth, followed = begun
+        frames = self._simulate(begun, on_frame)
+        path = np.stack(frames.positions)
         times = np.arange(len(path)) / self.frame_rate
-        record: dict[str, Array] = {}
-        for name in forces[0]:
-            record[name] = np.stack([of_frame[name] for of_frame in forces])
-        for name, at in self.tracks.items():
-            record[name] = np.stack([np.asarray(at(float(time))) for time in times])
-        # Without self-contact cloth may pass through itself, so crossings are no fault.
-        evidence = checks.Seen(
-            cloth,
-            # A lost run stops between frames, and its last positions may be no numbers.
-            np.concatenate([path, cloth.positions[None]]),
-            max(crossed) if self.self_contact else 0,
-            uneven_until(times[-1], cloth, hands.driving(self.motion)),
-            self.others,
-        )
+        evidence = self._evidence(frames, cloth, hands)
         worst = checks.values(evidence)
         # A start that is no equilibrium spoils the run even if all checks pass.
         code, reason = (
@@ -271,24 +269,76 @@ class Scene:
             rest=self.mesh.rest,
             triangles=self.mesh.triangles,
             times=times,
-            record={**record, **self.record},
+            record={**frames.record(), **self._tracked(times), **self.record},
             labels={
                 "kernel": cloth.kernel,
                 "steps": cloth.total.steps,
                 "unconverged_steps": cloth.total.unconverged,
                 "worst_residual": cloth.worst_residual,
                 **worst,
-                **followed.labels(derivatives),
+                **followed.labels(frames.derivatives),
             },
-            self_intersections=np.array(crossed, np.int32),
+            self_intersections=np.array(frames.crossings, np.int32),
             least_distance=cloth.total.least_distance,
-            rest_time=rest_time,
+            rest_time=frames.rest_time,
             code=code,
             reason=reason,
-            sensitivities=followed.over_frames(derivatives),
+            sensitivities=followed.over_frames(frames.derivatives),
         )
         # Labels of the scene may depend on the run, such as the side on which a cloth landed.
         return replace(run, labels={**run.labels, **self.labels(run)})
+
+    def _simulate(self, begun: Begun, on_frame: OnFrame | None) -> _Frames:
+        """Return the frames up to the end of the scene, or until a check has failed."""
+        _, cloth, followed = begun
+        verdict = checks.Verdict(cloth)
+        frames = _Frames()
+        first = frame_at(cloth, 0.0, self._bodies)
+        frames.add(first, self.forces(cloth), followed.at_frame(first))
+        calm = 0
+        # No run of a scene with a reason is valid, so it has its first frame alone.
+        for number in range(1, 1 if self.reason else self.frames):
+            time = number / self.frame_rate
+            self._advance(begun, time, verdict)
+            # A check has failed, or the budget is spent, and the cloth has not reached the frame.
+            if cloth.time < time:
+                break
+            frame = frame_at(cloth, time, self._bodies)
+            frames.add(frame, self.forces(cloth), followed.at_frame(frame))
+            if on_frame is not None:
+                on_frame(number + 1, self.frames)
+            if verdict.see_frame(frame.crossings if self.self_contact else 0):
+                break
+            calm = calm + 1 if self._is_still(time, *frames.positions[-2:]) else 0
+            if calm >= REST_TIME * self.frame_rate:
+                frames.rest_time = time
+                # Every sample of the scene has the same number of frames.
+                frames.repeat_last(self.frames - len(frames.positions))
+                break
+        return frames
+
+    def _bodies(self, time: float) -> Sequence[Body]:
+        return self.motion(time)[1]
+
+    def _evidence(self, frames: _Frames, cloth: Cloth, hands: Hands) -> checks.Seen:
+        """Return the arguments of the checks of a run that has ended."""
+        last_time = (len(frames.positions) - 1) / self.frame_rate
+        return checks.Seen(
+            cloth,
+            # A lost run stops between frames, and its last positions may be no numbers.
+            np.stack([*frames.positions, cloth.positions]),
+            # Without self-contact cloth may pass through itself, so crossings are no fault.
+            max(frames.crossings) if self.self_contact else 0,
+            uneven_until(last_time, cloth, hands.driving(self.motion)),
+            self.others,
+        )
+
+    def _tracked(self, times: Floats) -> Record:
+        """Return the poses and other functions of the time at the frames (F,) [s], by name."""
+        tracked: dict[str, Array] = {}
+        for name, at in self.tracks.items():
+            tracked[name] = np.stack([np.asarray(at(float(time))) for time in times])
+        return tracked
 
     def _is_still(self, time: float, before: Floats, now: Floats) -> bool:
         """Return whether nothing moved between two frames (V, 3) [m], and nothing will move."""

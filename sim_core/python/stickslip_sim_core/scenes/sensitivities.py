@@ -109,7 +109,7 @@ class Sensitivity:
         return bool(self.positions.any())
 
 
-class _AtFrame(NamedTuple):
+class AtFrame(NamedTuple):
     """Derivatives at one frame, by each parameter."""
 
     positions: Floats
@@ -176,7 +176,7 @@ class Followed:
         report = self._cloth.sensitivity_report
         self._unrefined, self._change = report.unrefined, max(self._change, report.change)
 
-    def at_frame(self, frame: Frame) -> _AtFrame:
+    def at_frame(self, frame: Frame) -> AtFrame:
         """Return the derivatives at a frame in the last step."""
         nearest = self._nearest
         self._nearest = np.full(len(self._by), np.inf)
@@ -184,9 +184,9 @@ class Followed:
         # All later derivatives are made from those of the step that was not solved.
         if not self._change < UNSOLVED:
             positions = np.full_like(positions, np.nan)
-        return _AtFrame(positions, nearest)
+        return AtFrame(positions, nearest)
 
-    def over_frames(self, frames: Sequence[_AtFrame]) -> dict[str, Sensitivity]:
+    def over_frames(self, frames: Sequence[AtFrame]) -> dict[str, Sensitivity]:
         """Return the derivatives at all frames, by the names of parameters."""
         over = {}
         for number, by in enumerate(self._by):
@@ -198,7 +198,7 @@ class Followed:
             )
         return over
 
-    def labels(self, frames: Sequence[_AtFrame]) -> dict[str, Any]:
+    def labels(self, frames: Sequence[AtFrame]) -> dict[str, Any]:
         """Return how well derivatives were solved, and how large each is.
 
         `largest_by_NAME` is the largest derivative of a coordinate [m per unit]. It is 0 if the

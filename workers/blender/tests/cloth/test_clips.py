@@ -131,8 +131,8 @@ def test_the_cloth_is_lit_alike_everywhere_and_the_floor_at_all_times(
     for frame, instant in zip(clip, (0, 3), strict=True):
         points = renderer.geometry.points(sheet.track[instant], instant)
         window = window_about(projected(camera, points[: renderer.geometry.cloth_vertices]), camera)
-        seen = see(projected(camera, points), renderer.geometry.triangles, window)
-        cloth = seen.share_below(renderer.geometry.cloth_triangles) == 1.0
+        visibility = see(projected(camera, points), renderer.geometry.triangles, window)
+        cloth = visibility.share_below(renderer.geometry.cloth_triangles) == 1.0
         brightness.append(frame[window.slices][cloth].mean())
         away[window_about(projected(camera, points), camera, 20).slices] = False
     assert brightness[1] == pytest.approx(brightness[0], rel=0.08)

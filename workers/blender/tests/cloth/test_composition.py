@@ -35,7 +35,7 @@ def test_composed_pictures_are_what_the_formula_says() -> None:
         axis=-1,
     ).astype(np.float16)
     coverage = RANDOM.uniform(0.1, 1.0, (6, 6)).astype(np.float32) * chosen
-    seen, reflected, overall = (
+    visibility, reflected, overall = (
         RANDOM.uniform(0.0, 1.0, shape).astype(np.float32) for shape in [(6, 6, 9), (6, 7, 9), (9,)]
     )
     floor = RANDOM.uniform(0.5, 1.5, (height, width, 3)).astype(np.float32)
@@ -45,7 +45,7 @@ def test_composed_pictures_are_what_the_formula_says() -> None:
         ALBEDOS,
         overall,
         coverage,
-        seen,
+        visibility,
         window.place,
         reflected,
         around.place,
@@ -58,7 +58,7 @@ def test_composed_pictures_are_what_the_formula_says() -> None:
     around_it = np.tile(overall.astype(np.float64), (*gloss.shape, 1))
     around_it[around.times(FINE).slices] = reflected.repeat(FINE, 0).repeat(FINE, 1)
     cover, over = np.zeros((*gloss.shape, 1)), np.zeros_like(around_it)
-    cover[window.slices], over[window.slices] = coverage[..., None], seen
+    cover[window.slices], over[window.slices] = coverage[..., None], visibility
     of_cloth = at[0] + (at[1] - at[0] + slope * (overall - ALBEDOS[1])) * over / ALBEDOS[0]
     expected = np.where(cover > 0.0, of_cloth, at[1] + slope * (around_it - ALBEDOS[1]))
     expected = expected.reshape(*gloss.shape, count, 3)
@@ -103,21 +103,21 @@ def test_levels_are_near_the_exact_values_and_those_of_grey_are_equal() -> None:
     )
     assert (hues == 0).mean() > (rounded == 0).mean() + 0.2
 
-    brighter, fresh, kept = (
+    brighter, fresh, cached = (
         (np.float16(1.01) * shading).view(np.uint16),
         np.zeros_like(pictures),
         pictures.copy(),
     )
-    for made in (fresh, kept):
+    for composed in (fresh, cached):
         _raster.compose(
-            brighter, ALBEDOS, overall, nothing, none, nowhere, none, nowhere, floor, made
+            brighter, ALBEDOS, overall, nothing, none, nowhere, none, nowhere, floor, composed
         )
-    stays = (kept == pictures).all(axis=-1)
+    stays = (cached == pictures).all(axis=-1)
     exact = np.stack(
         np.split(_srgb(1.01 * light[..., None].astype(np.float64) * overall), 2, axis=-1)
     )
-    assert np.abs(kept - exact).max() <= TOLERANCE + 0.3
-    assert np.array_equal(kept[~stays], fresh[~stays])
+    assert np.abs(cached - exact).max() <= TOLERANCE + 0.3
+    assert np.array_equal(cached[~stays], fresh[~stays])
     assert stays.mean() > (fresh == pictures).all(axis=-1).mean() + 0.2
 
 

@@ -92,10 +92,10 @@ def test_a_texture_of_the_users_own_is_printed_on_the_cloth(
 
 def test_a_task_says_which_pictures_it_reads(store: DirectoryStore, record: str) -> None:
     digest = store.publish(_png(_flag()))
-    own = cloth_task(record, texture="my-flag", image=f"sha256:{digest}")
+    custom = cloth_task(record, texture="my-flag", image=f"sha256:{digest}")
     together = cloth_task(record, textures=["dots", f"sha256:{digest}"])
     for task, expected in (
-        (own, (record, digest)),
+        (custom, (record, digest)),
         (together, (record, digest)),
         (cloth_task(record), (record,)),
     ):
@@ -117,57 +117,63 @@ def test_a_camera_of_the_users_own_sees_what_that_of_the_rig_sees(
     actor: RenderActor, store: DirectoryStore, record: str
 ) -> None:
     """The calibration of a camera of the rig, at twice the size, in a wide image."""
-    (ours,) = (camera for camera in load_rig("drag") if camera.name == "left")
+    (built_in,) = (camera for camera in load_rig("drag") if camera.name == "left")
     from math import acos
 
-    R = np.asarray(ours.rotation)
+    R = np.asarray(built_in.rotation)
     angle = acos((np.trace(R) - 1.0) / 2.0)
     axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / (
         2.0 * np.sin(angle)
     )
-    own = Calibration(
+    calibrated = Calibration(
         image_size=(648, 448),
         camera_matrix=(
-            (2 * ours.fx, 0.0, 2 * (ours.cx + 0.5) - 0.5 + 100),
-            (0.0, 2 * ours.fy, 2 * (ours.cy + 0.5) - 0.5),
+            (2 * built_in.fx, 0.0, 2 * (built_in.cx + 0.5) - 0.5 + 100),
+            (0.0, 2 * built_in.fy, 2 * (built_in.cy + 0.5) - 0.5),
             (0.0, 0.0, 1.0),
         ),
         distortion=(0.0, 0.0, 0.0, 0.0, 0.0),
         rvec=tuple((angle * axis).tolist()),
-        tvec=ours.translation,
+        tvec=built_in.translation,
     ).camera("lab")
     for name in ("fx", "fy", "cx", "cy", "rotation", "translation"):
-        np.testing.assert_allclose(getattr(own, name), getattr(ours, name), atol=1e-9)
-    seen = _frame(
+        np.testing.assert_allclose(getattr(calibrated, name), getattr(built_in, name), atol=1e-9)
+    frame = _frame(
         store,
-        output_of(actor, cloth_task(record, viewpoint="lab", camera=own.model_dump(mode="json"))),
+        output_of(
+            actor, cloth_task(record, viewpoint="lab", camera=calibrated.model_dump(mode="json"))
+        ),
     )
     expected = _frame(store, output_of(actor, cloth_task(record, viewpoint="left")))
-    assert (np.abs(seen.astype(int) - expected) > 2).mean() < 0.002
+    assert (np.abs(frame.astype(int) - expected) > 2).mean() < 0.002
 
 
 def test_a_lens_shows_what_the_straight_camera_sees_elsewhere(
     actor: RenderActor, store: DirectoryStore, record: str
 ) -> None:
-    ours = load_rig("drag")[1]
-    bent = ours.model_copy(
+    built_in = load_rig("drag")[1]
+    bent = built_in.model_copy(
         update={"distortion": (-2.0, 1.0, 0.01, -0.02, 0.0)}
     )  # of a lens that sees 25 degrees
-    straight, seen = (
+    straight, curved = (
         _frame(
             store,
             output_of(
                 actor, cloth_task(record, viewpoint="lab", camera=camera.model_dump(mode="json"))
             ),
         )
-        for camera in (ours, bent)
+        for camera in (built_in, bent)
     )
     rows, columns = np.mgrid[:224, :224]
-    x, y = distorted((columns - ours.cx) / ours.fx, (rows - ours.cy) / ours.fy, bent.distortion)
-    place = np.rint(np.stack([ours.fy * y + ours.cy, ours.fx * x + ours.cx])).astype(int)
+    x, y = distorted(
+        (columns - built_in.cx) / built_in.fx, (rows - built_in.cy) / built_in.fy, bent.distortion
+    )
+    place = np.rint(
+        np.stack([built_in.fy * y + built_in.cy, built_in.fx * x + built_in.cx])
+    ).astype(int)
     assert np.abs(place - (rows, columns)).max() >= 8, "pixels by which the lens moves a corner"
-    shown = seen[place[0].clip(0, 223), place[1].clip(0, 223)]
-    far, off = (np.abs(frame.astype(int) - straight).mean() for frame in (seen, shown))
+    sampled = curved[place[0].clip(0, 223), place[1].clip(0, 223)]
+    far, off = (np.abs(frame.astype(int) - straight).mean() for frame in (curved, sampled))
     assert off < 0.4 * far, "levels"
 
 

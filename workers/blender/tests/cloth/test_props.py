@@ -15,10 +15,10 @@ def test_marks_of_the_floor_are_not_on_props(make_sheet: Callable[..., Any]) -> 
     geometry = Geometry(sheet.triangles, sheet.rest, Holders(sheet.rest))
     camera = load_rig("drag")[0]
     points = geometry.points(sheet.track[1], 1)
-    seen = ground_truth(geometry, points, points, camera)["segmentation"]
+    codes = ground_truth(geometry, points, points, camera)["segmentation"]
     floor = np.full((camera.height, camera.width, 3), 2.0, dtype=np.float32)
     marked = Composer(geometry).floor_factor(points, camera, floor)
-    inner = {code: marked[_inside(seen == code)] for code in (GROUND, CLOTH, PROP)}
+    inner = {code: marked[_inside(codes == code)] for code in (GROUND, CLOTH, PROP)}
     assert all(len(values) > 20 for values in inner.values())
     assert np.allclose(inner[GROUND], 2.0)
     assert np.allclose(inner[CLOTH], 1.0)

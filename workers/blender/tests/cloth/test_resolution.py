@@ -16,6 +16,7 @@ from stickslip_blender.raster import Window, decoded
 from stickslip_schemas.documents.tasks import RenderOutput
 from stickslip_schemas.format.codecs import decode_chunk, decode_clip
 from stickslip_schemas.spec.cameras import Camera, rig_cameras
+from stickslip_schemas.spec.names import Calibration
 from stickslip_schemas.store import DirectoryStore
 from stickslip_testing.render_tasks import cloth_task, output_of
 
@@ -122,21 +123,58 @@ def test_marks_are_where_their_labels_say(
     actor: RenderActor, store: DirectoryStore, record: str, size: tuple[int, int]
 ) -> None:
     """White marks over white cloth under the same light: their share of each pixel."""
-    marks, white = (f"sha256:{store.publish(_png(picture))}" for picture in _printed())
-    task = cloth_task(
-        record, resolution=size, texture="marks", image=marks, textures=[marks, white]
+    _check_marks(actor, store, record, _camera(size), resolution=size)
+
+
+@pytest.mark.slow
+def test_marks_are_where_a_lens_with_its_resolution_shows_them(
+    actor: RenderActor, store: DirectoryStore, record: str
+) -> None:
+    """A camera of OpenCV with a distorted lens, in its own pixels."""
+    size = (640, 480)
+    pose = _camera((224, 224))
+    rotation = np.asarray(pose.rotation)
+    angle = np.arccos((np.trace(rotation) - 1.0) / 2.0)
+    axis = (rotation - rotation.T)[[2, 0, 1], [1, 2, 0]] / (2.0 * np.sin(angle))
+    focal_length = pose.fx * size[1] / 224
+    lens = Calibration(
+        image_size=size,
+        camera_matrix=((focal_length, 0.0, 322.0), (0.0, focal_length, 236.0), (0.0, 0.0, 1.0)),
+        distortion=(-0.4, 0.2, 0.001, -0.0005, 0.0),
+        rvec=tuple((angle * axis).tolist()),
+        tvec=pose.translation,
+        resolution=size,
     )
+    camera = lens.camera("desk", (224, 224))
+    assert (camera.width, camera.height) == size
+    _check_marks(
+        actor,
+        store,
+        record,
+        camera,
+        viewpoint="desk",
+        camera=camera.model_dump(mode="json"),
+        resolution=size,
+    )
+
+
+def _check_marks(
+    actor: RenderActor, store: DirectoryStore, record: str, seen_by: Camera, **settings: Any
+) -> None:
+    """Render white marks and white cloth, and compare the marks with their labels."""
+    size = (seen_by.width, seen_by.height)
+    marks, white = (f"sha256:{store.publish(_png(picture))}" for picture in _printed())
+    task = cloth_task(record, texture="marks", image=marks, textures=[marks, white], **settings)
     clips = output_of(actor, task).clips
     frames = [_frame(store, clips[name].output, size) for name in (marks, white)]
-    shown, lit = (decoded(frame).astype(float).sum(axis=2) for frame in frames)
+    level, lit = (decoded(frame).astype(float).sum(axis=2) for frame in frames)
 
-    camera = _camera(size)
-    rows, columns = np.indices(shown.shape)
+    rows, columns = np.indices(level.shape)
     for mark in MARKS:
-        expected = _middle_of_mark(camera, mark)
-        reach = 1.35 * RADIUS * SIDE * camera.fx / camera.project(np.zeros((1, 3)))[1][0]
+        expected = _middle_of_mark(seen_by, mark)
+        reach = 1.35 * RADIUS * SIDE * seen_by.fx / seen_by.project(np.zeros((1, 3)))[1][0]
         near = np.hypot(columns - expected[0], rows - expected[1]) < reach
-        share = shown[near] / lit[near]
+        share = level[near] / lit[near]
         share = (share - share.min()) / (np.median(share[share > 0.5]) - share.min())
         # Within the mark and beside it, only noise and light from other cloth differ from 1 and 0.
         share = np.where(share > 1.0 - PLAIN, 1.0, np.where(share < PLAIN, 0.0, share))

@@ -41,7 +41,7 @@ def test_the_noise_of_references_is_not_an_error_of_the_clip() -> None:
     for noise in (0.1, 0.4):
         light = decoded(truth) * (1.0 + noise * random.standard_normal((4, *truth.shape)))
         light[2:, :200] = np.nan
-        found = pool_errors(
+        pooled = pool_errors(
             [
                 (
                     errors(np.dstack([clip] * 3), light[..., None], 0),
@@ -50,7 +50,7 @@ def test_the_noise_of_references_is_not_an_error_of_the_clip() -> None:
             ]
         )
         exact = 10.0 * np.log10(255.0**2 / 9.0)
-        assert abs(found.psnr[0] - exact) < max(0.15, 2.5 * found.deviations[0])
+        assert abs(pooled.psnr[0] - exact) < max(0.15, 2.5 * pooled.deviations[0])
     white, bright = np.full((8, 8, 3), 255, dtype=np.uint8), np.full((2, 8, 8, 3), 1.7)
     assert errors(white, bright, 0).max() < 1e-4
 
@@ -60,10 +60,10 @@ def test_frames_in_the_shade_count_though_they_are_not_measured() -> None:
     large.
     """
     measured = np.ones((3, 64, 64))
-    found = pool_errors([(np.full((64, 64), 4.0), measured)], mean_weights=(1.0, 3.0, 1.0))
+    pooled = pool_errors([(np.full((64, 64), 4.0), measured)], mean_weights=(1.0, 3.0, 1.0))
     exact = [10.0 * np.log10(255.0**2 / (4.0 * usual)) for usual in (1.0, 3.0, 1.0)]
-    assert found.psnr == pytest.approx(exact)
-    assert min(found.deviations) > 1.0  # of one frame
+    assert pooled.psnr == pytest.approx(exact)
+    assert min(pooled.deviations) > 1.0  # of one frame
 
 
 def test_a_region_of_too_few_pixels_has_no_number() -> None:
@@ -97,6 +97,12 @@ def test_deviations_grow_with_the_spread_of_frames_and_of_blocks() -> None:
     assert pool_errors(frames).deviations == pytest.approx([expected] * 3)
     assert pool_errors(frames).psnr == pytest.approx(pool_errors(even).psnr)
 
+    # Frames that were not measured have another error: one of three, and none of two.
+    of_three, of_two = pool_errors(frames, frame_count=3), pool_errors(frames, frame_count=2)
+    expected = 10.0 / np.log(10.0) * np.sqrt(within**2 + between / 3)
+    assert of_three.deviations == pytest.approx([expected] * 3)
+    assert of_two.deviations == pytest.approx([10.0 / np.log(10.0) * within] * 3)
+
 
 def test_a_mean_below_zero_counts_as_its_deviation() -> None:
     """Products of noise may be negative: the error is then as large as chance makes it."""
@@ -128,11 +134,14 @@ def test_a_clip_below_its_floor_says_so() -> None:
 
 def test_measured_frames_are_drawn_from_equal_parts_of_the_clip() -> None:
     for seed in range(20):
-        drawn = instants(30, 0.25, 6, (seed, 3))
-        assert [frame // (30 // len(drawn)) for frame in drawn] == list(range(len(drawn)))
+        drawn = instants(30, 0.25, 6, 2, (seed, 3))
+        for part, frame in enumerate(drawn):
+            assert int(30 * part / len(drawn)) <= frame < 30 * (part + 1) / len(drawn)
         assert len(drawn) >= 3
-    assert instants(5, 9.0, 16, (1, 3)) == [0, 1, 2, 3, 4]
-    assert len(instants(2, 0.0, 4, (1, 3))) == 1
+    assert instants(5, 9.0, 16, 2, (1, 3)) == [0, 1, 2, 3, 4]
+    # One frame of a short clip says little about the others.
+    assert instants(3, 0.1, 4, 2, (1, 3)) == [0, 1, 2]
+    assert len(instants(12, 0.1, 4, 2, (1, 3))) == 4
     assert measured_group("checker") == ("checker", "dots", "stripes")
     names = [str(texture) for texture in Texture]
     for number, name in enumerate(names):
@@ -175,9 +184,9 @@ def test_a_composed_picture_is_the_direct_one(sheet: Any, material: str, substra
     weights, usual = clip.weights(shading)
     ((_, light),) = clip.references(pictures, [0])
     for channel, video in enumerate(videos):
-        found = pool_errors([(errors(video[0], light, channel), weights[0])], usual)
-        assert min(found.psnr) > 28.0, names[channel]
-        assert found.psnr[0] > 35.0, names[channel]
+        pooled = pool_errors([(errors(video[0], light, channel), weights[0])], usual)
+        assert min(pooled.psnr) > 28.0, names[channel]
+        assert pooled.psnr[0] > 35.0, names[channel]
 
 
 @pytest.mark.parametrize(

@@ -36,7 +36,7 @@ def flat(width: float, height: float, cells: int) -> tuple[Any, Any]:
     )
 
 
-def made(screen: float | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
+def scene_and_record(screen: float | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return a scene and its record: a sheet that rises over a cloth on the floor, bodies of all
     kinds, a holder.
 
@@ -103,7 +103,7 @@ def made(screen: float | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def staged(**options: Any) -> tuple[Stage, Geometry, Any]:
-    scene, record = made(**options)
+    scene, record = scene_and_record(**options)
     return *set_up(scene, record), record["towel.positions"]
 
 
@@ -169,14 +169,14 @@ def test_bodies_are_where_the_record_has_them_and_a_little_inside(usual: Any) ->
 
 def test_everything_has_a_code_and_its_colour(usual: Any) -> None:
     stage, geometry, track = usual
-    names = scene_segments(*(made()[0][key] for key in ("sheets", "bodies")))
+    names = scene_segments(*(scene_and_record()[0][key] for key in ("sheets", "bodies")))
     camera = framed(
         "high", np.concatenate([track[-1], *stage.placed(2, track[-1])]), size=(224, 224)
     )
     points = geometry.points(track[-1], 2)
     truth = ground_truth(geometry, points, points, camera)
-    seen = {names[code] for code in np.unique(truth["segmentation"])}
-    assert seen == {*names} - {"background"}
+    visible = {names[code] for code in np.unique(truth["segmentation"])}
+    assert visible == {*names} - {"background"}
     cloth = np.isin(truth["segmentation"], [names.index("rug"), names.index("towel")])
     assert np.isfinite(truth["uv"][cloth]).all()
     assert np.isnan(truth["uv"][~cloth]).all()
@@ -210,7 +210,7 @@ def test_a_camera_goes_around_what_hides_the_cloth() -> None:
 
 
 def test_a_scene_without_a_plane_has_no_floor() -> None:
-    scene, record = made()
+    scene, record = scene_and_record()
     record["body_pose"] = np.delete(record["body_pose"], [*scene["bodies"]].index("floor"), axis=1)
     del scene["bodies"]["floor"]
     stage, geometry = set_up(scene, record)
@@ -225,7 +225,7 @@ def test_a_scene_without_a_plane_has_no_floor() -> None:
 
 def test_an_actor_renders_a_scene(tmp_path: Any) -> None:
     """The clip, the ground truth and the label of the camera that framed it."""
-    scene, record = made()
+    scene, record = scene_and_record()
     store = DirectoryStore(tmp_path / "store")
     file = io.BytesIO()
     np.savez(file, **{name: values[None] for name, values in record.items()})
@@ -275,12 +275,12 @@ def rays(camera: Any) -> Any:
     )
 
 
-def degrees_between(one: Any, other: Any) -> Any:
-    return np.degrees(np.arccos(np.clip((one.astype(float) * other).sum(axis=-1), -1.0, 1.0)))
+def degrees_between(first: Any, other: Any) -> Any:
+    return np.degrees(np.arccos(np.clip((first.astype(float) * other).sum(axis=-1), -1.0, 1.0)))
 
 
 def test_a_ball_that_turns_has_the_normals_and_the_flow_of_its_formula() -> None:
-    scene, record = made()
+    scene, record = scene_and_record()
     turn = np.radians(6.0)
     record["body_pose"][1, 0, :, :3] = [
         [np.cos(turn), -np.sin(turn), 0],
@@ -301,15 +301,15 @@ def test_a_ball_that_turns_has_the_normals_and_the_flow_of_its_formula() -> None
     met = along**2 - square * (
         center @ center - radius**2
     )  # a ray meets the ball where this is positive
-    kept = met > 0.1 * square * radius**2  # away from the silhouette
-    assert kept.sum() > 4000
+    is_inside = met > 0.1 * square * radius**2  # away from the silhouette
+    assert is_inside.sum() > 4000
     normal = ((along - np.sqrt(np.maximum(met, 0.0))) / square)[:, None] * ray - center
-    angle = degrees_between(truth["normals"][rows, columns], normal / radius)[kept]
+    angle = degrees_between(truth["normals"][rows, columns], normal / radius)[is_inside]
     moved, _ = camera.project(normal @ rotation @ record["body_pose"][1, 0, :, :3].T + middle)
     error = np.linalg.norm(
         truth["flow"][rows, columns] - moved + np.column_stack([columns, rows]), axis=1
-    )[kept]
-    print(kept.sum(), np.percentile(angle, [50, 99]), np.percentile(error, [50, 99]))
+    )[is_inside]
+    print(is_inside.sum(), np.percentile(angle, [50, 99]), np.percentile(error, [50, 99]))
     assert np.median(angle) < 1.0
     assert np.percentile(angle, 99) < 4.0
     assert np.percentile(error, 99) < 0.05
@@ -327,7 +327,7 @@ def test_normals_of_bodies_are_those_of_their_depth(
     usual: Any, name: str, middle: Any, half: float
 ) -> None:
     _, geometry, track = usual
-    names = scene_segments(*(made()[0][key] for key in ("sheets", "bodies")))
+    names = scene_segments(*(scene_and_record()[0][key] for key in ("sheets", "bodies")))
     camera = framed("high", corners_about(middle, half), size=(224, 224))
     points = geometry.points(track[0], 0)
     truth = ground_truth(geometry, points, points, camera)
@@ -335,12 +335,12 @@ def test_normals_of_bodies_are_those_of_their_depth(
     normal = np.cross(np.gradient(place, axis=0), np.gradient(place, axis=1))
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     near = np.lib.stride_tricks.sliding_window_view(normal, (7, 7), axis=(0, 1))
-    kept = np.pad(np.ptp(near, axis=(-2, -1)).max(axis=-1) < 0.02, 3) & (
+    is_smooth = np.pad(np.ptp(near, axis=(-2, -1)).max(axis=-1) < 0.02, 3) & (
         truth["segmentation"] == names.index(name)
     )
-    angle = degrees_between(truth["normals"], normal)[kept]
-    print(name, kept.sum(), (truth["segmentation"] == names.index(name)).sum())
+    angle = degrees_between(truth["normals"], normal)[is_smooth]
+    print(name, is_smooth.sum(), (truth["segmentation"] == names.index(name)).sum())
     print(name, np.percentile(angle, [50, 99]) if len(angle) else "")
-    assert kept.sum() > 300
+    assert is_smooth.sum() > 300
     assert np.median(angle) < 1.0
     assert np.percentile(angle, 99) < 4.0

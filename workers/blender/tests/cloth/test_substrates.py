@@ -55,17 +55,17 @@ def test_held_out_lamps_are_not_among_those_to_train_with() -> None:
 def test_marks_lie_still_on_the_floor() -> None:
     """Two cameras see the same mark at the same place of the floor."""
     substrate = drawn_substrate("matt", 3)
-    one, other = load_rig("drag")[:2]
+    left, other = load_rig("drag")[:2]
     place = np.array(
         [[x, y, FLOOR] for x in np.linspace(0.0, 0.3, 12) for y in np.linspace(-0.1, 0.1, 9)]
     )
-    seen = []
-    for camera in (one, other):
+    centers = []
+    for camera in (left, other):
         factor = floor_factor(substrate, camera, FLOOR)
         column, row = np.rint(camera.project(place)[0]).astype(int).T
-        seen.append(factor[row, column, 0])
-    assert np.std(seen[0]) > 0.1
-    assert np.corrcoef(seen)[0, 1] > 0.7  # a pixel apart at most
+        centers.append(factor[row, column, 0])
+    assert np.std(centers[0]) > 0.1
+    assert np.corrcoef(centers)[0, 1] > 0.7  # a pixel apart at most
 
 
 def test_fabrics_differ_in_their_grain(sheet: Any) -> None:
@@ -78,12 +78,12 @@ def test_fabrics_differ_in_their_grain(sheet: Any) -> None:
     inner = {
         material: picture[20:-20, 20:-20].astype(float) for material, picture in prints.items()
     }
-    for one, other in combinations(
+    for first, other in combinations(
         inner.values(), 2
     ):  # prints of one brightness that a pixel of 3 mm still shows
         coarse = [
             (p / p.mean())[:216, :216, 0].reshape(54, 4, 54, 4).mean(axis=(1, 3))
-            for p in (one, other)
+            for p in (first, other)
         ]
         assert np.std(coarse[0] - coarse[1]) > 0.035
     for picture in prints.values():

@@ -84,12 +84,12 @@ def test_an_unknown_device_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_device_names_and_driver_are_in_every_build(monkeypatch: pytest.MonkeyPatch) -> None:
     digest = render_context.build_digest.__wrapped__
-    found = {digest("rod_hang")}
+    digests = {digest("rod_hang")}
     for driver, names in (("550", ["one"]), ("570", ["one"]), ("570", ["another"])):
         gpu = {"device": "optix", "names": names, "driver": driver}
         monkeypatch.setattr(render_context, "described", lambda gpu=gpu: gpu)
-        found.add(digest("rod_hang"))
-    assert len(found) == 4
+        digests.add(digest("rod_hang"))
+    assert len(digests) == 4
 
 
 def test_a_scene_without_a_wish_is_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -94,6 +94,6 @@ def test_blender_agrees_about_projection(camera: Camera) -> None:
     for point in POINTS:
         x, y, depth = world_to_camera_view(scene, view, Vector(point))
         pixel, own_depth = camera.project(point)
-        seen = (x * camera.width - 0.5, (1.0 - y) * camera.height - 0.5)
-        np.testing.assert_allclose(seen, pixel, atol=2e-3)
+        by_blender = (x * camera.width - 0.5, (1.0 - y) * camera.height - 0.5)
+        np.testing.assert_allclose(by_blender, pixel, atol=2e-3)
         assert depth == pytest.approx(float(own_depth), abs=1e-5)

@@ -52,25 +52,28 @@ def _places(window: Window, grid: int) -> npt.NDArray[np.float64]:
 def _plain(points: Any, triangles: Any, window: Window, grid: int) -> npt.NDArray[np.int32]:
     places = _places(window, grid)
     flat = places.reshape(-1, 2)
-    seen, nearest = np.full(len(flat), -1, dtype=np.int32), np.zeros(len(flat), dtype=np.float32)
+    visibility, nearest = (
+        np.full(len(flat), -1, dtype=np.int32),
+        np.zeros(len(flat), dtype=np.float32),
+    )
     for number, triangle in enumerate(triangles):
         corners = np.broadcast_to(points[triangle][None, :, :2], (len(flat), 3, 2))
         weights = barycentric(corners, flat)
         near = (weights @ (1.0 / points[triangle][:, 2])).astype(np.float32)
         hit = (weights >= 0.0).all(axis=1) & (near > nearest)
-        seen[hit], nearest[hit] = number, near[hit]
-    return seen.reshape(places.shape[:2])
+        visibility[hit], nearest[hit] = number, near[hit]
+    return visibility.reshape(places.shape[:2])
 
 
 @pytest.mark.parametrize("grid", [1, 4, GRID])
 def test_what_is_seen_is_what_a_plain_rasteriser_sees(grid: int) -> None:
     points, triangles, _ = _soup()
     window = Window(2, 1, 15, 12)
-    seen = see(points, triangles, window, grid)
+    visibility = see(points, triangles, window, grid)
     expected = _plain(points, triangles, window, grid)
     assert (expected >= 0).mean() > 0.3
     assert (
-        seen.triangle != expected
+        visibility.triangle != expected
     ).mean() < 1e-3  # of samples that lie on an edge, rounding decides
 
 
@@ -101,13 +104,13 @@ def test_albedo_is_the_mean_of_textures_over_what_is_seen() -> None:
     points, triangles, uv = _soup()
     window, grid, end = Window(0, 0, 16, 16), 6, 25
     pictures = [RANDOM.integers(0, 256, (16, 16, 3), dtype=np.uint8) for _ in range(3)]
-    seen = see(points, triangles, window, grid)
-    sight = see_albedo(seen, uv, Textures(pictures), end)
+    visibility = see(points, triangles, window, grid)
+    sight = see_albedo(visibility, uv, Textures(pictures), end)
     places = _places(window, grid)
     for row in range(16):
         for column in range(16):
             cell = np.s_[row * grid : (row + 1) * grid, column * grid : (column + 1) * grid]
-            number, place = seen.triangle[cell].ravel(), places[cell].reshape(-1, 2)
+            number, place = visibility.triangle[cell].ravel(), places[cell].reshape(-1, 2)
             odd = np.indices((grid, grid)).sum(axis=0).ravel() % 2
             hit = (number >= 0) & (number < end)
             assert sight.coverage[row, column] == pytest.approx(hit.mean())
@@ -123,15 +126,15 @@ def test_albedo_is_the_mean_of_textures_over_what_is_seen() -> None:
             for texture, picture in enumerate(pictures):
                 expected = _looked_up(picture, where).mean(axis=0)
                 np.testing.assert_allclose(sight.mean[row, column, texture], expected, atol=1e-4)
-    own = seen.triangle[(seen.triangle >= 0) & (seen.triangle < end)]
-    assert np.array_equal(sight.hits, np.bincount(own, minlength=end))
+    of_sheet = visibility.triangle[(visibility.triangle >= 0) & (visibility.triangle < end)]
+    assert np.array_equal(sight.hits, np.bincount(of_sheet, minlength=end))
 
 
 def test_coverage_of_a_triangle_is_its_area() -> None:
     points = np.array([[1.3, 2.1, 1.0], [27.8, 6.4, 1.0], [9.2, 29.9, 1.0]])
-    seen = see(points, np.array([[0, 1, 2]], dtype=np.int32), Window(0, 0, 32, 32))
+    visibility = see(points, np.array([[0, 1, 2]], dtype=np.int32), Window(0, 0, 32, 32))
     (a, b), (c, d) = points[1, :2] - points[0, :2], points[2, :2] - points[0, :2]
-    assert seen.share_below(1).sum() == pytest.approx(abs(a * d - b * c) / 2, rel=2e-4)
+    assert visibility.share_below(1).sum() == pytest.approx(abs(a * d - b * c) / 2, rel=2e-4)
 
 
 def test_decoding_is_within_its_bound() -> None:
@@ -156,18 +159,18 @@ def test_values_at_centers_are_interpolated_in_perspective() -> None:
     corners = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
     points = projected(camera, corners)
     window = window_about(points, camera)
-    seen = see(points, np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32), window, grid=1)
-    places = seen.at_centers(np.column_stack([corners, points[:, 2]]), fill=np.nan)
-    rows, columns = np.nonzero(seen.triangle >= 0)
-    found = places[rows, columns]
-    assert len(found) > 300
+    visibility = see(points, np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32), window, grid=1)
+    places = visibility.at_centers(np.column_stack([corners, points[:, 2]]), fill=np.nan)
+    rows, columns = np.nonzero(visibility.triangle >= 0)
+    interpolated = places[rows, columns]
+    assert len(interpolated) > 300
     pixels, depth = camera.project(
-        found[:, :3]
+        interpolated[:, :3]
     )  # the place on the square that a pixel sees projects onto the pixel
     np.testing.assert_allclose(
         pixels, np.column_stack([columns + window.left, rows + window.top]), atol=1e-9
     )
-    np.testing.assert_allclose(depth, found[:, 3], atol=1e-9)
+    np.testing.assert_allclose(depth, interpolated[:, 3], atol=1e-9)
 
 
 def test_a_triangle_that_reaches_behind_the_camera_is_not_seen() -> None:

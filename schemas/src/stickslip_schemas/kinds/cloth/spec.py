@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from enum import StrEnum
-from math import prod
+from math import ceil, prod
 from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 from pydantic import Field, ValidationError, model_validator
@@ -73,6 +73,15 @@ SubstrateAxis = Annotated[
 FRAME_COST = 0.1
 """Share of the cost of a shading that is that of the whole frame: fitted to frames of 128 x 128 to
 640 x 480 (`benchmarks/clip_psnr.py`)."""
+
+
+MEASURED_FRAME_COST = 0.75
+"""Cost of measuring a frame of up to `MEASURED_TOGETHER` textures, over that of its shading: three
+such groups cost 2.25 times the shading (`stickslip_blender.cloth.quality.instants`)."""
+
+MEASURED_TOGETHER = 3
+LEAST_MEASURED = 4
+"""Textures that are measured together, and frames of a clip that are measured at least."""
 
 
 class Custom(NamedTuple):
@@ -271,10 +280,11 @@ class ClipSpec(JobSpec):
         sizes = {"resolution": self.resolution, "canvas": self.canvas}
         return settings | sizes | {"instants": self.shown_instants}
 
-    def clip_costs(self, simulate: float, uncertainty_factor: float) -> Costs:
+    def clip_costs(self, simulate: float, uncertainty_factor: float, render_factor: float) -> Costs:
         """Return CPU times of clips.
 
-        Measuring the clips of eight textures costs the fraction `measured` of their shading.
+        Measuring the clips of eight textures costs the fraction `measured` of their shading, and
+        more of clips of few frames, of which `LEAST_MEASURED` are measured.
         """
         # CPU time of shading a frame [s], fitted to `benchmarks/job_costs.py`.
         frame_seconds = {"preview": 0.66, "draft": 0.95, "standard": 1.3, "high": 5.0}
@@ -283,15 +293,25 @@ class ClipSpec(JobSpec):
         area = self._mean_over_pictures(prod)
         window = self._mean_over_pictures(lambda size: min(size) ** 2)
         enlargement = (1.0 - FRAME_COST) * window + FRAME_COST * area
-        shade = frame_seconds[self.quality] * self.frames * enlargement
-        # Composing a texture is cheap. Measuring its quality renders some frames again.
-        render = 0.01 * self.frames * enlargement + self.measured * shade / 8
+        frame = frame_seconds[self.quality] * enlargement
+        # Direct renderings of small pictures have up to four times the paths.
+        reference = frame_seconds[self.quality] * max(enlargement, min(1.0, 4.0 * enlargement))
+        # Measuring the quality of a texture renders some frames again, for up to three at once.
+        textures = axis_values(self.named_axes["texture"])
+        groups = ceil(len(textures) / MEASURED_TOGETHER) / len(textures)
+        measured_frames = 0.0
+        if self.measured:
+            usual = self.measured * self.frames / (3 * MEASURED_FRAME_COST)
+            measured_frames = min(max(usual, LEAST_MEASURED), self.frames)
+        render = 0.01 * self.frames * enlargement
+        render += measured_frames * MEASURED_FRAME_COST * groups * reference
         return Costs(
             simulate * (1.0 + sensitivities.COST * len(self.sensitivities)),
             render,
-            shade,
+            self.frames * frame,
             pack=0.02 * area,
             uncertainty_factor=uncertainty_factor,
+            render_factor=render_factor,
         )
 
     def cost_group(self, stage: Stage, point: Mapping[str, Any]) -> str:

@@ -38,7 +38,7 @@ from stickslip_blender.cloth.shading import FINE
 from stickslip_blender.raster import Window, decoded, projected, see
 
 PATHS = 2
-"""Paths per pixel of a shading in a direct rendering.
+"""Paths per pixel of a shading in a direct rendering of a large window.
 
 The rendering skips as many paths before them, because Cycles sends the first path through the
 middle of the pixel.
@@ -55,6 +55,11 @@ _SET_UP_PATHS = 1  # cost of a rendering beside its paths [paths per pixel of it
 _GROUP_SIZE = 3  # textures that are measured together: one in each colour channel
 LANDED = 0.04  # height above the floor up to which cloth counts as landed [m]
 BAND = 2  # half the width of the band along the silhouette [px]
+LEAST_FRAMES = 4
+"""Frames of a clip that are measured at least, or all of a shorter clip.
+
+The squared errors of frames differ by 60 %, and those of a short clip, which shows far apart
+instants, by more: one of three frames was up to 5 dB off the clip."""
 FEWEST = 30  # least pixels of a region, over all measured instants, for a PSNR
 DEVIATIONS = 2.0  # standard deviations below a floor that count as chance
 _SPREAD = 0.6  # usual deviation of the errors of instants over their mean
@@ -118,17 +123,22 @@ def measured_group(texture: str) -> tuple[str, ...]:
     return tuple(names[first : first + _GROUP_SIZE])
 
 
-def instants(frames: int, share: float, paths: int, seed: Sequence[int]) -> list[int]:
+def instants(
+    frames: int, share: float, paths: int, reference_paths: int, seed: Sequence[int]
+) -> list[int]:
     """Draw the frames to measure, each from an equal part of the clip.
 
-    At least one frame is measured. Measuring three groups of textures costs about `share` of the
-    cost of their shading. A shading has `paths` paths in each part of a pixel.
+    Measuring three groups of textures costs about `share` of the cost of their shading, and more of
+    a clip of which only `LEAST_FRAMES` are measured. A shading has `paths` paths in each part of a
+    pixel, and a direct rendering has `reference_paths`.
     """
     # Cost of measuring a frame for three groups, over the cost of its shading.
-    reference_cost = _GROUP_SIZE * (WHOLE + 0.5 * OF_LANDED) * (PATHS * FINE**2 + _SET_UP_PATHS)
+    reference_cost = (
+        _GROUP_SIZE * (WHOLE + 0.5 * OF_LANDED) * (reference_paths * FINE**2 + _SET_UP_PATHS)
+    )
     shading_cost = FINE**2 * paths + _FIXED_PATHS
     cost = reference_cost / shading_cost
-    count = min(max(1, round(share * frames / cost)), frames)
+    count = min(max(LEAST_FRAMES, round(share * frames / cost)), frames)
 
     # Draw one frame in each of `count` equal parts. The draws cover the whole clip, and no instant
     # is fixed.
@@ -188,30 +198,35 @@ def errors(picture: npt.NDArray[np.uint8], references: npt.NDArray[Any], channel
 
 
 def pool_errors(
-    frames: Sequence[tuple[Floats, npt.NDArray[Any]]], mean_weights: Sequence[float] = (1.0,) * 3
+    frames: Sequence[tuple[Floats, npt.NDArray[Any]]],
+    mean_weights: Sequence[float] = (1.0,) * 3,
+    frame_count: float = np.inf,
 ) -> Measured:
     """Return the PSNR of a clip by region, from the errors and weights of its measured frames.
 
     Errors are (height, width), in squared 8-bit levels. Weights are (3, height, width), and 0
     outside of a region. `mean_weights` are the means of the weights over the regions in all frames
-    of the clip.
+    of the clip, and `frame_count` is their number.
     """
+    # Of a clip whose frames are all measured, none has another error (finite population).
+    unmeasured = 1.0 - len(frames) / frame_count
     psnr: list[float] = []
     deviations: list[float] = []
     for region, mean_weight in zip(range(len(REGIONS)), mean_weights, strict=True):
         region_frames = [(error, weights[region]) for error, weights in frames]
-        level, deviation = _pool_region(region_frames, mean_weight)
+        level, deviation = _pool_region(region_frames, mean_weight, unmeasured)
         psnr.append(level)
         deviations.append(deviation)
     return Measured(tuple(psnr), tuple(deviations))
 
 
 def _pool_region(
-    frames: Sequence[tuple[Floats, npt.NDArray[Any]]], mean_weight: float
+    frames: Sequence[tuple[Floats, npt.NDArray[Any]]], mean_weight: float, unmeasured: float
 ) -> tuple[float, float]:
     """Return the PSNR of one region and its standard deviation [dB].
 
-    Both are NaN if the region is too small.
+    `unmeasured` is the share of the frames that were not measured. Both are NaN if the region is
+    too small.
     """
     if sum(np.count_nonzero(weights) for _, weights in frames) < FEWEST:
         return np.nan, np.nan
@@ -242,7 +257,7 @@ def _pool_region(
     between = (spread_squares + _TRUST * _SPREAD**2) / (count - 1 + _TRUST) / count
 
     # Convert the relative deviation of the squared error to decibels.
-    deviation = float(np.sqrt((within / bounded) ** 2 + between))
+    deviation = float(np.sqrt((within / bounded) ** 2 + unmeasured * between))
     psnr = float(10.0 * np.log10(255.0**2 / (bounded * mean_weight)))
     return psnr, 10.0 / np.log(10.0) * deviation
 

@@ -182,15 +182,19 @@ class ClothSampling:
     """
     floors: tuple[float, float, float]
     """Least PSNR of a clip over the cloth, its landed part and its edge [dB]."""
+    reference_ratio: float = 1.0
+    """Paths per pixel of a direct rendering, over those of one of a large window."""
 
     def over(self, area: float) -> ClothSampling:
         """Return a sampling with more paths if the window has a small area [px^2].
 
-        The cost stays the same.
+        The cost stays the same, down to a certain area.
         """
+        ratio = max(_FULL_AREA / max(area, 1.0), 1.0)
         return replace(
             self,
-            window=round(self.window * min(max(_FULL_AREA / max(area, 1.0), 1.0), _MAX_PATH_RATIO)),
+            window=round(self.window * min(ratio, _MAX_PATH_RATIO)),
+            reference_ratio=min(ratio, _MAX_REFERENCE_RATIO),
         )
 
     @property
@@ -200,6 +204,7 @@ class ClothSampling:
 
 
 _FULL_AREA = 13_000.0  # least area of a window that needs no additional paths [px^2]
+_MAX_REFERENCE_RATIO = 4.0  # the same of direct renderings: few pixels leave much of their noise
 _MAX_PATH_RATIO = 1.6  # largest factor of the paths in a smaller window
 
 # These numbers are frozen. A change makes other pictures and another build digest.
