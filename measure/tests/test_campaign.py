@@ -113,7 +113,7 @@ def test_the_page_says_who_holds_and_why_a_cell_has_no_value(
     page = write_page(tmp_path).read_text()
     assert "<h1>Who holds, and who creeps</h1>" in page
     # The verdict, the cell of creep, and the reason of both; text of an adapter is no markup.
-    assert '<td class="poor" title="ValueError: &lt;lost&gt;">no answer</td>' in page
+    assert '<td class="none" title="ValueError: &lt;lost&gt;">no answer</td>' in page
     assert "failed: ValueError: &lt;lost&gt;" in page
     assert "<lost>" not in page
     assert "not supported: needs curved, planes" in page

@@ -101,8 +101,9 @@ def verdict(cells: Sequence[Cell]) -> str:
     if cell is None:
         return '<td class="none">not asked</td>'
     if cell.value is None:
-        word = "sleeps" if cell.state == "sleeps" else "no answer"
-        return f'<td class="poor" title="{escape(cell.reason)}">{word}</td>'
+        # Only a simulator that sleeps has been found out: others gave no answer, and did not fail.
+        mark, word = ("poor", "sleeps") if cell.state == "sleeps" else ("none", "no answer")
+        return f'<td class="{mark}" title="{escape(cell.reason)}">{word}</td>'
     if cell.value < CREEP:
         return '<td class="good">holds</td>'
     return '<td class="poor">creeps</td>'
