@@ -103,4 +103,4 @@ def add_body(builder: Any, body: Any, cloth: float) -> None:
     if body.kind == "plane":
         builder.add_shape_plane(xform=place, width=0.0, length=0.0, cfg=shape)
     else:
-        builder.add_shape_cylinder(-1, place, radius=body.radius, half_height=1.0, cfg=shape)
+        builder.add_shape_cylinder(-1, xform=place, radius=body.radius, half_height=1.0, cfg=shape)
