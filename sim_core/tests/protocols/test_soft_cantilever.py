@@ -33,8 +33,10 @@ def test_master_goes_on_beyond_the_corner_of_its_law() -> None:
 
 @pytest.mark.physics
 def test_protocol_measures_softening() -> None:
-    settings = {"gamma": (10.0,), "cells": (10, 20, 40), "unstructured": 0}
-    result = protocols.run("soft-cantilever", softening=(16.0,), **settings)
+    cells = (10, 20, 40)
+    result = protocols.run(
+        "soft-cantilever", softening=(16.0,), gamma=(10.0,), cells=cells, unstructured=0
+    )
     (curve,) = result.curves
     assert curve.measured[0] == pytest.approx(curve.master[0], rel=2e-3)
     # A strip of constant rigidity hangs by 15 % less.
