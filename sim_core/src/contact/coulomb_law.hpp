@@ -31,8 +31,11 @@
 //     stick    1    1      1                0
 //     slip     1    0      mu (r_N + q)/|z_T|  mu
 //
-// The smoothed law has values between these. How the contact enters the linear system is no part of
-// the law: see linearized_contact.hpp.
+// The smoothed law has values between these. From here mu reaches the linear system by two ways,
+// both in linearized_contact.hpp: c couples friction to the normal force in the product of the
+// matrix (`NodeRow::coupling`, `PairRow::turning`), and b_s is a stiffness against a turn
+// of friction, which is symmetric and also enters what is factorised (`ContactState::penalty` for
+// nodes, `PairFactor` for pairs).
 #pragma once
 
 #include <Eigen/Core>

@@ -206,9 +206,9 @@ class ContactState {
   FrictionCoefficient mu_at(int node, const BodyContact& on, const Eigen::Vector3d& p,
                             const Eigen::Vector3d& friction, const std::vector<Body>& at_end) const;
 
-  // Contact of a node as a penalty, for factors: xx xy xz yy yz zz, N/m. k n n^T where it slips,
-  // and against a turn of friction; k in all directions where it sticks; k by the node's own
-  // stiffness.
+  // What contact adds to the block of a node in the matrix that is factorised: xx xy xz yy yz zz,
+  // N/m. k n n^T where it slips, and the stiffness against a turn of friction, which mu sets; k in
+  // all directions where it sticks; k by the node's own stiffness.
   void penalty(int node, double own, float* out) const;
 
  private:

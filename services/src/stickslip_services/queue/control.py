@@ -1,7 +1,8 @@
 """Control of jobs by users: cancel, pause, resume, prioritise, and retry a task.
 
 Each of these is one transaction. It writes one row of `jobs`, an event and an audit entry, whatever
-the number of tasks. Workers hear at their next heartbeat which tasks to drop.
+the number of tasks. Workers hear at their next heartbeat which tasks to drop: with a pause those
+that they have not started, with a cancellation those too that they have (`heartbeat.py`).
 """
 
 from collections.abc import Iterator

@@ -102,9 +102,9 @@ def requeue(tx: QueueTransaction, leased: Collection[TaskRow], *, is_lost: bool 
 def requeue_lost(
     tx: QueueTransaction, leased: Sequence[LeasedTask], settings: Settings, *, message: str
 ) -> None:
-    """End the leases of a lost worker.
+    """End the leases that a worker has lost: it is gone, or it never received them.
 
-    A task fails after `max_losses` lost workers.
+    A task fails after `max_losses` workers that were lost while they ran it.
     """
     not_started: list[LeasedTask] = []
     lost: list[LeasedTask] = []

@@ -284,7 +284,10 @@ def settle_jobs(tx: QueueTransaction) -> None:
 
 
 def settle_job(tx: QueueTransaction, job: int) -> None:
-    """Make the transition of a job that was just paused or cancelled, if none of its tasks runs."""
+    """End the transition of a job that was just paused or cancelled.
+
+    It waits while a worker has a task on lease, started or not, that only this job needs.
+    """
     for waiting in _WAITING_JOBS.rows(tx.connection):
         if waiting.seq == job:
             _settle(tx, waiting)
