@@ -280,7 +280,7 @@ class _Search:
             self._residual,
             # The search needs a start between the bounds, and not on one of them.
             self._transformed(begin.clip(1.001 * self._low, 0.999 * self._high)),
-            jac=self._by_transformed,  # type: ignore[arg-type]
+            jac=self._by_transformed,
             bounds=(self._transformed(self._low), self._transformed(self._high)),
             x_scale="jac",
             xtol=TOLERANCE,
