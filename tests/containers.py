@@ -196,7 +196,10 @@ class Container:
     @property
     def inner(self) -> int:
         """Its first process."""
-        children = Path(f"/proc/{self.outer}/task/{self.outer}/children").read_text().split()
+        try:
+            children = Path(f"/proc/{self.outer}/task/{self.outer}/children").read_text().split()
+        except FileNotFoundError:  # the outer process has ended, too
+            children = []
         if not children:
             raise SystemExit(f"{self.name} has ended:\n{self.log}")
         return int(children[0])

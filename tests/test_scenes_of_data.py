@@ -186,7 +186,9 @@ class TestLanguage:
         caught = run.positions[2, -1]
         assert caught[2] == pytest.approx(-0.5 * GRAVITY * 0.1**2, abs=5e-3)
         assert run.positions[-1, -1] == pytest.approx(caught + np.array([0.0, 0.0, 0.05]), abs=1e-9)
-        assert run.record["holder_force"][-1, 0, 2] == pytest.approx(WEIGHT, rel=0.3)  # it swings
+        # It swings, and hangs by its weight on average over the second in which the hand rests.
+        resting = run.record["holder_force"][-20:, 0, 2]
+        assert resting.mean() == pytest.approx(WEIGHT, rel=0.1)
 
     @pytest.mark.parametrize(("tilt", "slips"), [(0.9, False), (1.1, True)])
     def test_a_slab_that_tilts_lets_go_at_mu(self, tilt: float, slips: bool) -> None:

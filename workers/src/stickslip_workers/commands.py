@@ -143,7 +143,9 @@ def _record(scene: Scene, document: dict[str, Any]) -> dict[str, npt.NDArray[Any
             sheet["start"] = {"type": "flat"}
     staged = cloth_scene.scene(document)
     times = np.linspace(0.0, (scene.frames - 1) / scene.frame_rate, FRAMES).tolist()
-    start = SimpleNamespace(positions=np.repeat(staged.start[None], FRAMES, axis=0))
+    positions = np.repeat(staged.start[None], FRAMES, axis=0)
+    # Nothing is simulated, so there are no derivatives.
+    start = SimpleNamespace(positions=positions, sensitivities={})
     tracks = {}
     for name, value_at in staged.tracks.items():
         tracks[name] = np.stack([np.asarray(value_at(time)) for time in times])
