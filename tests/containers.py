@@ -26,6 +26,7 @@ import yaml
 STATE = Path("/run/containers")
 """Volumes, and a file with the pids of each container."""
 NETWORK = "10.77.0"
+CHECKOUT = Path(__file__).parents[1]
 USER = "10001"
 """User of the images of this repository, which their Dockerfiles make."""
 
@@ -158,6 +159,9 @@ def mounts_of(service: dict[str, Any]) -> str:
     for item in service.get("tmpfs", ["/tmp"]):
         target, _, options = item.partition(":")
         lines.append(f"/bin/mount -t tmpfs -o {options or 'noexec'},mode=1777 tmpfs {target}")
+        # The programs are those of the checkout, also where a new file system hides it.
+        if CHECKOUT.is_relative_to(target):
+            lines.append(f"mkdir -p {CHECKOUT}; /bin/mount --bind /opt/stickslip {CHECKOUT}")
     if "shm_size" in service:
         lines.append(
             f"/bin/mount -t tmpfs -o size={service['shm_size'].removesuffix('b')} shm /dev/shm"
