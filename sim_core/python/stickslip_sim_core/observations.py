@@ -29,6 +29,11 @@ def check_frames(frames: Sequence[int], vertices: NDArray[np.intp], run: ClothRu
         )
 
 
+def points_at(frames: Sequence[int], vertices: NDArray[np.intp], points: Floats) -> Floats:
+    """Return what a run has (frame, vertex, xyz) at some frames and vertices: (T, K, 3)."""
+    return np.asarray(points[list(frames)][:, vertices])
+
+
 @dataclass(frozen=True, eq=False)
 class Vertices:
     """Positions of vertices at some frames.
@@ -62,13 +67,11 @@ class Vertices:
         check_frames(self.frames, self.vertices, run)
 
     def residual(self, run: ClothRun) -> Floats:
-        return np.asarray((self._picked(run.positions) - self.positions).ravel() / self.noise)
+        difference = points_at(self.frames, self.vertices, run.positions) - self.positions
+        return np.asarray(difference.ravel() / self.noise)
 
     def jacobian(self, run: ClothRun, derivative: Floats) -> Floats:
-        return np.asarray(self._picked(derivative).ravel() / self.noise)
-
-    def _picked(self, points: Floats) -> Floats:
-        return np.asarray(points[list(self.frames)][:, self.vertices])
+        return np.asarray(points_at(self.frames, self.vertices, derivative).ravel() / self.noise)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +139,7 @@ class MarkedPixels:
         return np.asarray(changes.ravel() / self.noise)
 
     def _points(self, points: Floats) -> Floats:
-        return np.asarray(points[list(self.frames)][:, self.vertices])
+        return points_at(self.frames, self.vertices, points)
 
 
 @dataclass(frozen=True, eq=False)
