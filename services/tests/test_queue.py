@@ -32,7 +32,7 @@ from stickslip_services.queue.documents import find_task
 from stickslip_services.queue.job_states import has_exclusive_lease
 from stickslip_services.queue.jobs import find_job, list_samples
 from stickslip_services.queue.lease import lease_tasks
-from stickslip_services.queue.rows import ACTIVE
+from stickslip_services.queue.rows import NEEDING_TASKS
 from stickslip_services.queue.submit import submit_job
 from stickslip_services.settings import Settings
 from stickslip_testing.invariants import violations
@@ -830,7 +830,7 @@ def test_a_job_of_millions_is_not_read_for_its_tasks_on_lease(settings: Settings
         if connection.dialect.name == "sqlite":
             driver: Any = connection.connection.dbapi_connection
             driver.set_trace_callback(statements.append)
-            assert not has_exclusive_lease(connection, 1, ACTIVE)
+            assert not has_exclusive_lease(connection, 1, NEEDING_TASKS)
             driver.set_trace_callback(None)
             plan = connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {statements[0]}").all()
             assert "tasks USING COVERING INDEX ix_tasks_owner" in str(plan)

@@ -266,7 +266,7 @@ void StaleFactor::make(Assembly& assembly, const Buffer<double>& x, const Contac
 
 void StaleFactor::refresh(const Assembly& assembly, const ContactState& contact) {
   for (int i = 0; i < assembly.numbering.free_nodes; ++i)
-    contact.penalty(i, assembly.own_stiffness(i), &added_[6L * i]);
+    contact.factor_block(i, assembly.own_stiffness(i), &added_[6L * i]);
   assembly.kernel.factor(view_, matrix_, added_.data());
   modes_ = contact.mode;
 }

@@ -64,7 +64,7 @@ int PairFactor::compare(const Assembly& assembly, const ContactState& contact) {
     const int node = static_cast<int>(i);
     bodies_[i].setZero();
     if (contact.mode[i] != contact_open)
-      contact.penalty(node, assembly.own_stiffness(node), bodies_[i].data());
+      contact.factor_block(node, assembly.own_stiffness(node), bodies_[i].data());
   }
   holds_ = bodies_;
   for (const Entry& entry : wanted_) add_holds(entry, holds_);

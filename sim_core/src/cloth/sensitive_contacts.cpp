@@ -70,7 +70,7 @@ Sensitivities::NodeContact Sensitivities::contact_of(int node, const Step& step)
         [&](int b) -> Vector3d { return p - carried(step.at_start[b], step.at_end[b], before); });
   }
   const double bound = contact.friction.mu * contact.bearing_force;
-  contact.turning = turning_of(bound, at.slip.norm(), at.stiffness);
+  contact.turn_stiffness = turn_stiffness_of(bound, at.slip.norm(), at.stiffness);
   return contact;
 }
 
@@ -79,13 +79,13 @@ void Sensitivities::classify_nodes(const Step& step) {
   for (int i = 0; i < assembly_.numbering.free_nodes; ++i) {
     const NodeContact& contact = nodes_[i] = contact_of(i, step);
     mode_[i] = contact.mode;
-    coupling_[i] = turning_[i] = 0.0f;
+    coupling_[i] = turn_stiffness_[i] = 0.0f;
     if (contact.mode == contact_open) continue;
     at_node(normal_, i) = contact.normal.cast<float>();
     if (contact.mode == contact_stick) continue;
     at_node(direction_, i) = contact.direction.cast<float>();
     if (contact.normal_force > 0.0) coupling_[i] = static_cast<float>(contact.friction.mu);
-    turning_[i] = static_cast<float>(contact.turning);
+    turn_stiffness_[i] = static_cast<float>(contact.turn_stiffness);
   }
 }
 
@@ -239,10 +239,10 @@ void Sensitivities::linearize_node(int parameter, int node, const Step& step,
   // turns no more than its bounded stiffness lets it.
   const double bound = mu * load;
   if (bound > 0.0)
-    mu_change += mu_by_direction(node, contact, step, -contact.turning / bound * across);
+    mu_change += mu_by_direction(node, contact, step, -contact.turn_stiffness / bound * across);
   Vector3d lacking = in_plane(force_change - normal_change * n - pressing * change.normal, n);
   lacking -= (coupling_[node] * load_change + mu_change * load) * t;
-  lacking += contact.turning * across;
+  lacking += contact.turn_stiffness * across;
   force = -lacking.cast<float>();
   correction = -(change.gap * n).cast<float>();
   contact.event = std::min(event_at(pressing, normal_change), event_at(length, slip_change.dot(t)));

@@ -13,7 +13,7 @@ namespace sim_core {
 constexpr double infinite = std::numeric_limits<double>::infinity();
 // Stiffness against a turn of friction over that of the law, from which a contact is as good as
 // stuck.
-constexpr double turning_max = 1e4;
+constexpr double turn_stiffness_max = 1e4;
 
 // The change of a parameter that takes `margin` to 0, to first order.
 inline double event_at(double margin, double rate) {
@@ -26,8 +26,8 @@ inline Eigen::Vector3d in_plane(const Eigen::Vector3d& vector, const Eigen::Vect
 
 // b_s k/(1 - b_s) of a contact that slides by `length` [m], whose friction is `bound` [N] and whose
 // law has the stiffness k [N/m]: the stiffness against a turn of friction, N/m.
-inline double turning_of(double bound, double length, double stiffness) {
-  const double most = turning_max * stiffness;
+inline double turn_stiffness_of(double bound, double length, double stiffness) {
+  const double most = turn_stiffness_max * stiffness;
   if (!(bound > 0.0)) return 0.0;
   return length > 0.0 ? std::min(bound / length, most) : most;
 }

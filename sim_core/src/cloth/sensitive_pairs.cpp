@@ -35,8 +35,8 @@ void Sensitivities::classify_pairs(const Step& step) {
       const double bound = at.mu * std::max(at.normal_force(), 0.0);
       contact.direction =
           asked.norm() > 0.0 ? Vector3d(asked.normalized()) : Vector3d(at.normal.unitOrthogonal());
-      contact.turning = turning_of(bound, slip.norm(), at.stiffness);
-      contact.softening = 1.0 / (1.0 + contact.turning / pair.proximal.tangential);
+      contact.turn_stiffness = turn_stiffness_of(bound, slip.norm(), at.stiffness);
+      contact.softening = 1.0 / (1.0 + contact.turn_stiffness / pair.proximal.tangential);
     }
     pairs_.push_back(contact);
     pair_arrays_.add(pair, assembly_.numbering.free_nodes);
@@ -100,7 +100,7 @@ void Sensitivities::linearize_pairs(int parameter) {
       const Vector3d& t = contact.direction;
       Vector3d lacking = friction_change;
       lacking -= (at.mu * normal_change + own_rate * std::max(pressing, 0.0)) * t;
-      lacking += contact.turning * (slip_change - slip_change.dot(t) * t);
+      lacking += contact.turn_stiffness * (slip_change - slip_change.dot(t) * t);
       const double along = lacking.dot(t);
       contact.right_side = -kappa * opening * n - (along + at.mu * kappa * opening) * t -
                            contact.softening * (lacking - along * t);
@@ -129,8 +129,8 @@ void Sensitivities::find_pair_updates() {
       motions.segment<3>(3) += pair.along_first[c] * d;
       motions.segment<3>(6) += pair.along_second[c] * d;
     }
-    contact.update =
-        contact.right_side - pair.row.stiffness * motions.head<3>() + pair.turning * motions;
+    contact.update = contact.right_side - pair.row.stiffness * motions.head<3>() +
+                     pair.force_by_motions * motions;
   }
 }
 

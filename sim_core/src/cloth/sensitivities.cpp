@@ -64,7 +64,7 @@ void Sensitivities::follow(const std::vector<SensitivityParameter>& parameters) 
   for (Buffer<float>* vectors : {&normal_, &direction_, &force_, &correction_, &solution_, &image_})
     *vectors = none;
   coupling_.assign(free_nodes, 0.0f);
-  turning_.assign(free_nodes, 0.0f);
+  turn_stiffness_.assign(free_nodes, 0.0f);
   work_.assign((2 * krylov_max + 1) * 4L * free_nodes + 64, 0.0f);
 }
 
@@ -281,7 +281,7 @@ double Sensitivities::refine(const Step& step) {
   subtract_corrections(matrix);
   std::fill(solution_.begin(), solution_.end(), 0.0f);
   const ContactRows rows{mode_.data(), normal_.data(), direction_.data(), coupling_.data(),
-                         turning_.data()};
+                         turn_stiffness_.data()};
   report_.krylov += assembly_.kernel.krylov(matrix, factor, rows, force_.data(), solution_.data(),
                                             work_.data(), round_tolerance);
   double change = 0.0, size = 0.0;

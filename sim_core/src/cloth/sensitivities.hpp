@@ -150,7 +150,7 @@ class Sensitivities {
     Eigen::Vector3d way;                             // over what it touches, not projected, m
     double normal_force = 0.0, bearing_force = 0.0;  // N: R_N, and that of both sides
     FrictionCoefficient friction;
-    double turning = 0.0;  // N/m
+    double turn_stiffness = 0.0;  // N/m
     // The change of the parameter by which it changes its branch, to first order.
     double event = 0.0;
   };
@@ -162,7 +162,7 @@ class Sensitivities {
     // Derivatives of rho by the places of the closest points.
     Eigen::Matrix<double, 3, 2> along_now, along_start;
     Eigen::Vector3d direction, way;
-    double turning = 0.0, softening = 1.0, distance = 0.0;
+    double turn_stiffness = 0.0, softening = 1.0, distance = 0.0;
     double event = 0.0;                                    // as of a node
     Eigen::Vector3d change = Eigen::Vector3d::Zero();      // of the force, N per unit
     Eigen::Vector3d update = Eigen::Vector3d::Zero();      // of that, by a round
@@ -223,8 +223,8 @@ class Sensitivities {
   std::unique_ptr<PairFactor> spare_pair_factor_;
 
   std::vector<int> mode_;
-  Buffer<float> normal_, direction_, coupling_, turning_, force_, correction_, solution_, image_,
-      work_;
+  Buffer<float> normal_, direction_, coupling_, turn_stiffness_, force_, correction_, solution_,
+      image_, work_;
   Buffer<double> derivative_;  // d
   Acceleration acceleration_;
   Buffer<double> by_parameter_, by_term_, stiffness_change_, pulled_, plus_, minus_, at_, at_start_;

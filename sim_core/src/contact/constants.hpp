@@ -26,7 +26,7 @@ constexpr double proximal = much;
 constexpr double factor = much * much;
 // Stiffness of friction against a turn of its direction, over k: beyond, a node is as good as
 // stuck.
-constexpr double turning_max = factor / law;
+constexpr double turn_stiffness_max = factor / law;
 // kappa/K and lambda/K under the smoothed law, which regularizes redundant pairs by itself. Sweep:
 // 500 takes 18 % more in a crumple, 2000 takes 23 % more.
 constexpr double smoothed_proximal = much * much * much;

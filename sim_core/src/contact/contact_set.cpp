@@ -22,7 +22,7 @@ using Eigen::Vector4d;
 //     dtheta_k)/d.
 void turn(Pair& pair, const Buffer<double>& x) {
   pair.sliding.setZero();
-  pair.turning.setZero();
+  pair.force_by_motions.setZero();
   if (!pair.active() || pair.contact.force.isZero(0.0)) return;
   const FourPoints at = points_of(pair.stencil, x);
   const int count =
@@ -44,7 +44,8 @@ void turn(Pair& pair, const Buffer<double>& x) {
   }
   Eigen::Matrix<double, 3, 9> displacement = a * pair.sliding;
   displacement.leftCols<3>() += Matrix3d::Identity();
-  pair.turning = pair.row.turning * (displacement - n * (n.transpose() * displacement)) / distance;
+  pair.force_by_motions =
+      pair.row.force_by_normal * (displacement - n * (n.transpose() * displacement)) / distance;
 }
 
 }  // namespace
@@ -82,7 +83,7 @@ PairPast::PairPast(const Pair& pair)
       normal(pair.contact.normal),
       middle(pair.middle),
       thickness(pair.thickness),
-      penalty_scale(pair.penalty_scale),
+      proximal_growth(pair.proximal_growth),
       missed(violation(pair.contact, pair.row.mode)),
       cone(pair.cone) {}
 
@@ -100,7 +101,7 @@ PairMotions Pair::motions(const Buffer<float>& change, int free_nodes) const {
 
 Eigen::Matrix<double, 9, 9> Pair::stiffness() const {
   Eigen::Matrix<double, 9, 9> out;
-  out.topRows<3>() = -turning;
+  out.topRows<3>() = -force_by_motions;
   out.topLeftCorner<3, 3>() += row.stiffness;
   out.middleRows<3>(3) = -contact.force * sliding.row(0);
   out.bottomRows<3>() = -contact.force * sliding.row(1);
@@ -118,7 +119,7 @@ Vector3d Pair::motion(const Buffer<float>& change, int free_nodes) const {
 
 Vector3d Pair::force_change(const Buffer<float>& change, int free_nodes) const {
   const PairMotions displacement = motions(change, free_nodes);
-  return row.force - row.stiffness * displacement.head<3>() + turning * displacement;
+  return row.force - row.stiffness * displacement.head<3>() + force_by_motions * displacement;
 }
 
 LawResponse Pair::law() const {
@@ -140,7 +141,7 @@ void ContactSet::store_history() {
     if (pair.contact.force.isZero(0.0)) continue;
     history_.emplace_back(pair);
     history_.back().change.setZero();
-    history_.back().penalty_scale = 1.0;
+    history_.back().proximal_growth = 1.0;
     if (has_static_) history_.back().cone = cone_after(pair.row.mode);
   }
   if (has_static_) ended_ = history_;
@@ -162,7 +163,7 @@ void ContactSet::update(const Buffer<double>& x, double step_length, Buffer<doub
 void ContactSet::add_stiffness(double fraction, std::vector<double>& stiffness) const {
   for (const Pair& pair : pairs_) {
     if (!pair.active()) continue;
-    const double own = fraction * pair.row.symmetric.trace() / (3.0 * pair.penalty_scale);
+    const double own = fraction * pair.row.symmetric.trace() / (3.0 * pair.proximal_growth);
     for (int c = 0; c < 4; ++c) {
       if (pair.stencil.node[c] < free_nodes_)
         stiffness[pair.stencil.node[c]] += pair.weights[c] * pair.weights[c] * own;
@@ -237,7 +238,7 @@ bool ContactSet::activate(const Buffer<float>& change) {
     const Vector3d force = pair.contact.force + pair.force_change(change, free_nodes_);
     if (force.dot(pair.contact.normal) >= 0.0) continue;
     pair.row = pair_row(pair.contact, {}, pair.proximal);  // open
-    pair.turning.setZero();
+    pair.force_by_motions.setZero();
     pair.sliding.setZero();
     pair.added = false;
     pair.released = changed = true;

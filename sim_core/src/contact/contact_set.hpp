@@ -37,10 +37,10 @@ struct Pair {
   // Derivatives by the motions: of the places of the closest points, and of the force as the normal
   // turns.
   Eigen::Matrix<double, 2, 9> sliding = Eigen::Matrix<double, 2, 9>::Zero();
-  Eigen::Matrix<double, 3, 9> turning = Eigen::Matrix<double, 3, 9>::Zero();
+  Eigen::Matrix<double, 3, 9> force_by_motions = Eigen::Matrix<double, 3, 9>::Zero();
   Eigen::Vector3d change = Eigen::Vector3d::Zero();  // of the force in the last linear problem, N
   PairRow row{};
-  double penalty_scale = 1.0;            // growth of its proximal stiffness in this attempt
+  double proximal_growth = 1.0;          // growth of its proximal stiffness in this attempt
   std::optional<Cone> cone = {};         // of friction; none before it is chosen
   bool added = false, released = false;  // in the linear problem at hand, whatever the law says
 
@@ -73,7 +73,7 @@ struct PairPast {
   Candidate stencil;
   int feature, mode;
   Eigen::Vector3d force, change, normal, middle;
-  double thickness, penalty_scale;
+  double thickness, proximal_growth;
   double missed;             // violation of its row, m; see `violation`
   std::optional<Cone> cone;  // as of a pair
 

@@ -73,12 +73,13 @@ LawResponse slipping(const Contact& contact) {
   return law;
 }
 
-LawResponse slipping_along(const Contact& contact, const Vector3d& direction, double turning) {
+LawResponse slipping_along(const Contact& contact, const Vector3d& direction,
+                           double turn_stiffness) {
   LawResponse law = slipping(contact);
   const Vector3d& n = contact.normal;
   law.direction = (direction - direction.dot(n) * n).normalized();
   // b_s k/(1 - b_s) is the stiffness against a turn.
-  law.derivative.across = turning / (turning + contact.stiffness);
+  law.derivative.across = turn_stiffness / (turn_stiffness + contact.stiffness);
   const Vector3d asked = asked_friction(contact);
   const Vector3d across = asked - law.direction.dot(asked) * law.direction;
   law.friction = contact.mu * law.bearing_force * law.direction + law.derivative.across * across;

@@ -33,8 +33,8 @@
 //
 // The smoothed law has values between these. From here mu reaches the linear system by two ways,
 // both in linearized_contact.hpp: c couples friction to the normal force in the product of the
-// matrix (`NodeRow::coupling`, `PairRow::turning`), and b_s is a stiffness against a turn
-// of friction, which is symmetric and also enters what is factorised (`ContactState::penalty` for
+// matrix (`NodeRow::coupling`, `PairRow::stiffness`), and b_s is a stiffness against a turn of
+// friction, which is symmetric and also enters what is factorised (`ContactState::factor_block` for
 // nodes, `PairFactor` for pairs).
 #pragma once
 
@@ -87,9 +87,9 @@ LawResponse smoothed_law(const Contact& contact, double epsilon);
 // Branches that are chosen, whatever the law says at the iterate.
 LawResponse sticking(const Contact& contact);
 LawResponse slipping(const Contact& contact);
-// Slips along `direction`; friction turns against `turning`, N/m.
+// Slips along `direction`; friction turns against `turn_stiffness`, N/m.
 LawResponse slipping_along(const Contact& contact, const Eigen::Vector3d& direction,
-                           double turning);
+                           double turn_stiffness);
 
 // The branch of an open contact that `motion` [m] closes: it sticks if it slips by no more than mu
 // times the length by which it would sink in, else it slips.

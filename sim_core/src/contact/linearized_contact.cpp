@@ -14,7 +14,7 @@ constexpr double negligible_stiffness = 1e-4;
 
 }  // namespace
 
-NodeRow node_row(const Contact& contact, const LawResponse& law, double turning_max) {
+NodeRow node_row(const Contact& contact, const LawResponse& law, double turn_stiffness_max) {
   NodeRow row;
   row.mode = law.mode;
   // Open: the node's force goes, in all directions.
@@ -35,8 +35,8 @@ NodeRow node_row(const Contact& contact, const LawResponse& law, double turning_
   row.correction = -contact.gap * contact.normal;
   row.coupling = d.coupling;
   const double freedom = 1.0 - d.across;
-  const double scale = freedom * turning_max > 1.0 ? 1.0 / freedom : turning_max;
-  row.turning = scale * d.across * contact.stiffness;
+  const double scale = freedom * turn_stiffness_max > 1.0 ? 1.0 / freedom : turn_stiffness_max;
+  row.turn_stiffness = scale * d.across * contact.stiffness;
   const Vector3d lacking = law.friction - contact.friction();
   const double bearing_force = contact.normal_force() + contact.pressed;
   const double along = t.dot(lacking) + d.coupling * (bearing_force - law.bearing_force);
@@ -82,9 +82,9 @@ PairRow pair_row(const Contact& contact, const LawResponse& law,
                   d.across / s_s * side;
   row.stiffness = row.symmetric + coupling * normal_stiffness * t * n.transpose();
   // As the normal turns, so does the plane of friction. A contact that sticks holds its force.
-  row.turning = normal_force * ((1.0 - d.along) / (k * s_t) * t * t.transpose() +
-                                (1.0 - d.across) / (k * s_s) * side) +
-                coupling * t * friction.transpose();
+  row.force_by_normal = normal_force * ((1.0 - d.along) / (k * s_t) * t * t.transpose() +
+                                        (1.0 - d.across) / (k * s_s) * side) +
+                        coupling * t * friction.transpose();
   return row;
 }
 

@@ -17,8 +17,8 @@
 //
 // The force of a pair is an unknown of its own, with a proximal term [Rockafellar 1976] by which
 // pairs that say the same do no harm: it adds b k/kappa dr_d, and vanishes as the iteration
-// converges. Then dr = force - stiffness v + turning dn (`PairRow`), with s = (1 - b)/k + b/kappa
-// and dr_d = -(b/s) v_d + (P_d - r_d)/(k s).
+// converges. Then dr = force - stiffness v + force_by_normal dn (`PairRow`), with
+// s = (1 - b)/k + b/kappa and dr_d = -(b/s) v_d + (P_d - r_d)/(k s).
 #pragma once
 
 #include <Eigen/Core>
@@ -35,11 +35,12 @@ struct NodeRow {
   Eigen::Vector3d force = Eigen::Vector3d::Zero();       // N
   Eigen::Vector3d correction = Eigen::Vector3d::Zero();  // m
   double coupling = 0.0;                                 // c
-  double turning = 0.0;                                  // N/m: against a turn of friction
+  double turn_stiffness = 0.0;                           // N/m: against a turn of friction
 };
 
-// `turning_max`: bound of `turning` over the stiffness k, from which a contact is as good as stuck.
-NodeRow node_row(const Contact& contact, const LawResponse& law, double turning_max);
+// `turn_stiffness_max`: bound of `turn_stiffness` over the stiffness k, from which a contact is as
+// good as stuck.
+NodeRow node_row(const Contact& contact, const LawResponse& law, double turn_stiffness_max);
 
 // Proximal stiffness of a pair, N/m.
 struct ProximalStiffness {
@@ -47,13 +48,13 @@ struct ProximalStiffness {
   double tangential;  // lambda
 };
 
-// dr = force - stiffness v + turning dn.
+// dr = force - stiffness v + force_by_normal dn.
 struct PairRow {
   ContactMode mode = contact_open;
   Eigen::Matrix3d stiffness = Eigen::Matrix3d::Zero();  // N/m
   Eigen::Matrix3d symmetric = Eigen::Matrix3d::Zero();  // N/m: without the coupling, for factors
   Eigen::Vector3d force = Eigen::Vector3d::Zero();      // N
-  Eigen::Matrix3d turning = Eigen::Matrix3d::Zero();    // N: friction turns with the normal
+  Eigen::Matrix3d force_by_normal = Eigen::Matrix3d::Zero();  // N: friction turns with the normal
 };
 
 PairRow pair_row(const Contact& contact, const LawResponse& law, const ProximalStiffness& proximal);

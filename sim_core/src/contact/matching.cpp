@@ -52,16 +52,17 @@ void ContactSet::transfer(double step_length) {
 // pairs that stall grows: those that stay off by much of what they were off before.
 void ContactSet::inherit(Pair& pair, const PairPast& past, double step_length) const {
   pair.contact.force = past.force + step_length * past.change;
-  pair.penalty_scale = past.penalty_scale;
+  pair.proximal_growth = past.proximal_growth;
   pair.cone = past.cone;
   const double now = violation(pair.contact, past.mode);
   const bool is_exact = smoothing == 0.0 && step_length == 1.0 && past.mode != contact_open;
   const bool was_near =
       past.missed > pairs::length_tolerance && past.missed < pairs::half_layer * pair.thickness;
   if (is_exact && was_near && now > pairs::converging * past.missed)
-    pair.penalty_scale = std::min(stiffness::growth * past.penalty_scale, stiffness::growth_max);
-  pair.proximal.normal *= pair.penalty_scale;
-  pair.proximal.tangential *= pair.penalty_scale;
+    pair.proximal_growth =
+        std::min(stiffness::growth * past.proximal_growth, stiffness::growth_max);
+  pair.proximal.normal *= pair.proximal_growth;
+  pair.proximal.tangential *= pair.proximal_growth;
 }
 
 // The force of a pair that is gone goes to the new pair of the same vertex, or of one of its edges,

@@ -80,22 +80,22 @@ ContactState::ContactState(int free_nodes)
       normal(4 * free_nodes + 64, 0.0f),
       direction(4 * free_nodes + 64, 0.0f),
       coupling(free_nodes, 0.0f),
-      turning(free_nodes, 0.0f),
+      turn_stiffness(free_nodes, 0.0f),
       force(4 * free_nodes + 64, 0.0f),
       correction(4 * free_nodes + 64, 0.0f),
       cone(free_nodes, Cone::sliding) {}
 
 ContactRows ContactState::rows() const {
-  return {mode.data(), normal.data(), direction.data(), coupling.data(), turning.data()};
+  return {mode.data(), normal.data(), direction.data(), coupling.data(), turn_stiffness.data()};
 }
 
-void ContactState::penalty(int node, double own, float* out) const {
+void ContactState::factor_block(int node, double own, float* out) const {
   std::fill(out, out + 6, 0.0f);
   if (mode[node] == contact_open) return;
   const float k = static_cast<float>(stiffness::factor) * static_cast<float>(own);
   const float* n = &normal[4L * node];
   const float* t = &direction[4L * node];
-  const float side = mode[node] == contact_stick ? k : std::min(turning[node], k);
+  const float side = mode[node] == contact_stick ? k : std::min(turn_stiffness[node], k);
   const float along = mode[node] == contact_stick ? k : 0.0f;
   // k n n^T + along t t^T + side (1 - n n^T - t t^T)
   int e = 0;
@@ -184,14 +184,14 @@ ForceNorms ContactState::classify_contacts(const Buffer<double>& x, const Buffer
                           at_node(direction, i).cast<double>().dot(law.direction) < 0.0;
     at_node(normal, i) = on.gap.normal.cast<float>();
     const LawResponse& chosen = stick_on_reversal && reversed ? sticking(contact) : law;
-    write(i, node_row(contact, chosen, stiffness::turning_max));
+    write(i, node_row(contact, chosen, stiffness::turn_stiffness_max));
     norms.count(missed_squared(contact, law));
   }
   return norms;
 }
 
 void ContactState::store_history(double dt) {
-  history_ = {mode, touched, direction, turning, dt};
+  history_ = {mode, touched, direction, turn_stiffness, dt};
   if (resting_.applies) {
     resting_.mode = mode;
     resting_.touched = touched;
@@ -234,8 +234,8 @@ bool ContactState::warm_start(const Buffer<double>& x, const Buffer<double>& sta
         history_.mode[i] == contact_stick
             ? sticking(contact)
             : slipping_along(contact, at_node(history_.direction, node).cast<double>(),
-                             static_cast<double>(history_.turning[i]) * history_.dt / dt);
-    // The turning of the last step is not bounded again.
+                             static_cast<double>(history_.turn_stiffness[i]) * history_.dt / dt);
+    // The stiffness of the last step is not bounded again.
     write(node, node_row(contact, law, std::numeric_limits<double>::infinity()));
   }
   return true;
@@ -293,7 +293,7 @@ void ContactState::write(int node, const NodeRow& row) {
   at_node(force, node) = row.force.cast<float>();
   at_node(correction, node) = row.correction.cast<float>();
   coupling[node] = static_cast<float>(row.coupling);
-  turning[node] = static_cast<float>(row.turning);
+  turn_stiffness[node] = static_cast<float>(row.turn_stiffness);
 }
 
 }  // namespace sim_core

@@ -148,7 +148,7 @@ class ContactState {
   std::vector<double> thickness;  // (free nodes): of the cloth, m
   std::vector<double> area;       // (free nodes): of the cloth, m^2
   std::vector<double> stiffness;  // (free nodes): k of the law, N/m
-  Buffer<float> normal, direction, coupling, turning;
+  Buffer<float> normal, direction, coupling, turn_stiffness;
   Buffer<float> force,
       correction;  // (free nodes, 4): the right-hand side, N, and what contact prescribes, m
 
@@ -209,7 +209,7 @@ class ContactState {
   // What contact adds to the block of a node in the matrix that is factorised: xx xy xz yy yz zz,
   // N/m. k n n^T where it slips, and the stiffness against a turn of friction, which mu sets; k in
   // all directions where it sticks; k by the node's own stiffness.
-  void penalty(int node, double own, float* out) const;
+  void factor_block(int node, double own, float* out) const;
 
  private:
   void write(int node, const NodeRow& row);
@@ -225,7 +225,7 @@ class ContactState {
 
   struct History {
     std::vector<int> mode, touched;
-    Buffer<float> direction, turning;
+    Buffer<float> direction, turn_stiffness;
     double dt = 0.0;  // 0: nothing is kept
   };
   History history_;

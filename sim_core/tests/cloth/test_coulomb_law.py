@@ -316,7 +316,7 @@ def test_nodes_and_pairs_obey_one_law(seed: int) -> None:
     """
     mu, stiff = 0.5, 1e9
     gap, n, slip, force = contact_of(SLIP, seed)
-    mode, t, node_force, correction, coupling, turning = core.node_row(
+    mode, t, node_force, correction, coupling, turn_stiffness = core.node_row(
         gap, n, slip, force, mu, K, 1e12
     )
     row_mode, stiffness, _, pair_force, _ = law(gap, n, slip, force, mu, (stiff, stiff))
@@ -327,7 +327,7 @@ def test_nodes_and_pairs_obey_one_law(seed: int) -> None:
     v = np.random.default_rng(seed).normal(size=3)
     v += (correction @ n - v @ n) * n  # the motion that contact prescribes along the normal
     change = pair_force - stiffness @ v
-    assert s @ change == pytest.approx(s @ node_force - turning * (s @ v), rel=1e-6)
+    assert s @ change == pytest.approx(s @ node_force - turn_stiffness * (s @ v), rel=1e-6)
     # Along t friction is on its cone at the new normal force, which a node leaves to its residual.
     assert t @ (force + change) == pytest.approx(mu * n @ (force + change), abs=1e-5)
     assert t @ node_force == pytest.approx(mu * (force @ n) - t @ force)
@@ -367,7 +367,9 @@ def test_friction_of_a_pair_turns_with_its_normal(seed: int) -> None:
     n, t, s = frame(seed)
     force = 2.0 * n + 1.2 * t + 0.9 * s
     stiff = 1e12
-    mode, _, _, _, _, turning = core.pair_row(0.0, n, np.zeros(3), force, mu, K, stiff, stiff)
+    mode, _, _, _, _, force_by_normal = core.pair_row(
+        0.0, n, np.zeros(3), force, mu, K, stiff, stiff
+    )
     assert mode == SLIP
 
     def missed(normal: Floats, r: Floats) -> Floats:
@@ -376,7 +378,7 @@ def test_friction_of_a_pair_turns_with_its_normal(seed: int) -> None:
 
     rng = np.random.default_rng(seed)
     turn = 0.3 * rng.normal() * t + 0.3 * rng.normal() * s  # of the normal
-    change = turning @ turn
+    change = force_by_normal @ turn
     step = 1e-6
     plus, minus = (missed(n + e * turn, force + e * change) for e in (step, -step))
     derivative = (plus - minus) / (2.0 * step)
@@ -402,12 +404,14 @@ def test_matrix_of_a_pair_moves_force_and_weights(seed: int) -> None:
         rng.normal(size=3),
         rng.normal(size=(3, 3)),
     )
-    sliding, turning = rng.normal(size=(2, 9)), rng.normal(size=(3, 9))
+    sliding, force_by_motions = rng.normal(size=(2, 9)), rng.normal(size=(3, 9))
     motions, change, stiffness = core.pair_changes(
-        weights, force, row_force, row_stiffness, sliding, turning, displacements
+        weights, force, row_force, row_stiffness, sliding, force_by_motions, displacements
     )
     assert motions == pytest.approx((weights.T @ displacements).ravel())
-    assert change == pytest.approx(row_force - row_stiffness @ motions[:3] + turning @ motions)
+    assert change == pytest.approx(
+        row_force - row_stiffness @ motions[:3] + force_by_motions @ motions
+    )
 
     slides = sliding @ motions
     of_weights = weights[:, 1:] @ slides

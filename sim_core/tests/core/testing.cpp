@@ -214,11 +214,11 @@ NB_MODULE(_testing, m) {
             smoothing > 0.0 ? smoothed_law(contact, smoothing) : coulomb_law(contact);
         const PairRow row = pair_row(contact, law, {along, across});
         return std::make_tuple(static_cast<int>(row.mode), row.stiffness, row.symmetric, row.force,
-                               missed_squared(contact, smoothing), row.turning);
+                               missed_squared(contact, smoothing), row.force_by_normal);
       },
       "gap"_a, "normal"_a, "slip"_a, "force"_a, "mu"_a, "stiffness"_a, "along"_a, "across"_a,
       "smoothing"_a = 0.0,
-      "mode, stiffness, its symmetric part, force, squared error and turning; see "
+      "mode, stiffness, its symmetric part, force, squared error and force by normal; see "
       "contact/linearized_contact.hpp.");
   m.def(
       "closing",
@@ -234,7 +234,7 @@ NB_MODULE(_testing, m) {
       "pair_changes",
       [](const Four& weights, const Eigen::Vector3d& force, const Eigen::Vector3d& row_force,
          const Eigen::Matrix3d& row_stiffness, const Eigen::Matrix<double, 2, 9>& sliding,
-         const Eigen::Matrix<double, 3, 9>& turning, const Four& displacements) {
+         const Eigen::Matrix<double, 3, 9>& force_by_motions, const Four& displacements) {
         Pair pair{};
         pair.stencil.node = {0, 1, 2, 3};
         pair.weights = weights.col(0);
@@ -244,14 +244,14 @@ NB_MODULE(_testing, m) {
         pair.row.force = row_force;
         pair.row.stiffness = row_stiffness;
         pair.sliding = sliding;
-        pair.turning = turning;
+        pair.force_by_motions = force_by_motions;
         Buffer<float> change(16);
         for (int c = 0; c < 4; ++c)
           at_node(change, c) = displacements.row(c).transpose().cast<float>();
         return std::make_tuple(pair.motions(change, 4), pair.force_change(change, 4),
                                pair.stiffness());
       },
-      "weights"_a, "force"_a, "row_force"_a, "row_stiffness"_a, "sliding"_a, "turning"_a,
+      "weights"_a, "force"_a, "row_force"_a, "row_stiffness"_a, "sliding"_a, "force_by_motions"_a,
       "displacements"_a,
       "motions, change of the force and stiffness of a pair; see contact/contact_set.hpp.");
   m.def(
@@ -261,9 +261,9 @@ NB_MODULE(_testing, m) {
         const Contact contact{gap, normal, slip, force, mu, stiffness};
         const NodeRow row = node_row(contact, coulomb_law(contact), turning_max);
         return std::make_tuple(static_cast<int>(row.mode), row.direction, row.force, row.correction,
-                               row.coupling, row.turning);
+                               row.coupling, row.turn_stiffness);
       },
       "gap"_a, "normal"_a, "slip"_a, "force"_a, "mu"_a, "stiffness"_a, "turning_max"_a,
-      "mode, direction, force, correction, coupling and turning; see "
+      "mode, direction, force, correction, coupling and turn stiffness; see "
       "contact/linearized_contact.hpp.");
 }

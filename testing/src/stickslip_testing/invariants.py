@@ -27,7 +27,7 @@ from stickslip_services.database.tables import (
 )
 from stickslip_services.queue.job_states import has_exclusive_lease, has_unsettled_job
 from stickslip_services.queue.progress import read_progress
-from stickslip_services.queue.rows import ACTIVE, ON_LEASE, SCHEDULABLE
+from stickslip_services.queue.rows import NEEDING_TASKS, ON_LEASE, SCHEDULABLE
 
 
 def violations(connection: Connection) -> list[str]:
@@ -53,7 +53,7 @@ def unsettled(connection: Connection) -> list[str]:
             ):
                 faults.append(f"job {row.seq} is pausing and nothing runs for it alone")
             if row.state == JobState.cancelling and not has_exclusive_lease(
-                connection, row.seq, ACTIVE
+                connection, row.seq, NEEDING_TASKS
             ):
                 faults.append(f"job {row.seq} is cancelling and nothing runs for it alone")
     for row in connection.execute(select(jobs.c.seq, jobs.c.state)):
@@ -127,15 +127,15 @@ def _dependency_faults(connection: Connection) -> list[str]:
 
 def _ready_faults(connection: Connection) -> list[str]:
     """Compare the queue with the tasks."""
-    is_active = jobs.c.state.in_(ACTIVE)
+    needs_tasks = jobs.c.state.in_(NEEDING_TASKS)
     expected = connection.execute(
         select(job_tasks.c.task, job_tasks.c.job, tasks.c.stage, tasks.c.cost_group)
         .join(tasks, tasks.c.seq == job_tasks.c.task)
         .join(jobs, jobs.c.seq == job_tasks.c.job)
-        .where(is_active, tasks.c.state == TaskState.pending, tasks.c.waiting_on == 0)
+        .where(needs_tasks, tasks.c.state == TaskState.pending, tasks.c.waiting_on == 0)
     )
     queued = connection.execute(
-        select(ready_tasks).join(jobs, jobs.c.seq == ready_tasks.c.job).where(is_active)
+        select(ready_tasks).join(jobs, jobs.c.seq == ready_tasks.c.job).where(needs_tasks)
     )
     missing = {tuple(row) for row in expected}
     surplus: set[tuple[object, ...]] = set()

@@ -33,7 +33,7 @@ from stickslip_services.queue.integrity import check_job
 from stickslip_services.queue.job_states import end_job, has_unsettled_job, settle_jobs
 from stickslip_services.queue.leaving import QueueCleaner
 from stickslip_services.queue.planner import Planner, plan_waiting_jobs, release_claims
-from stickslip_services.queue.rows import ACTIVE, IS_LEASED, SCHEDULABLE, JobRow, job_columns
+from stickslip_services.queue.rows import IS_LEASED, NEEDING_TASKS, SCHEDULABLE, JobRow, job_columns
 from stickslip_services.queue.scrub import scrub_when_idle
 from stickslip_services.queue.workers import update_unschedulable_jobs
 
@@ -116,7 +116,7 @@ def _settle(context: Context) -> None:
 _ACTIVE_JOBS = RowQuery(
     JobRow,
     select(*job_columns(JobRow)).where(
-        text("jobs.finished_at IS NULL"), jobs.c.state.in_([state.value for state in ACTIVE])
+        text("jobs.finished_at IS NULL"), jobs.c.state.in_([state.value for state in NEEDING_TASKS])
     ),
 )
 

@@ -22,7 +22,7 @@ from stickslip_schemas.documents.responses import (
 from stickslip_services.database.statements import RowQuery, Statement, ValueQuery, batches
 from stickslip_services.database.tables import events, jobs
 from stickslip_services.queue.ids import task_id
-from stickslip_services.queue.rows import ACTIVE, SCHEDULABLE, TaskRow
+from stickslip_services.queue.rows import NEEDING_TASKS, SCHEDULABLE, TaskRow
 from stickslip_services.queue.transaction import QueueTransaction
 
 # ---- Events --------------------------------------------------------------------------------------
@@ -191,7 +191,7 @@ def end_job(
 
 def is_active(connection: Connection, job: int) -> bool:
     """Return whether a job needs its tasks."""
-    query = select(jobs.c.seq).where(jobs.c.seq == job, jobs.c.state.in_(ACTIVE))
+    query = select(jobs.c.seq).where(jobs.c.seq == job, jobs.c.state.in_(NEEDING_TASKS))
     return connection.scalar(query) is not None
 
 
@@ -303,7 +303,7 @@ def _settle(tx: QueueTransaction, job: _WaitingJob) -> None:
         # A job that waits for the store keeps the message with the fault of the store.
         message = job.message if job.reason else "paused; resume it to go on"
         set_job_state(tx, job.seq, JobState.paused, reason=reason, message=message)
-    elif not has_exclusive_lease(tx.connection, job.seq, ACTIVE):
+    elif not has_exclusive_lease(tx.connection, job.seq, NEEDING_TASKS):
         message = "cancelled; finished results are kept and will not be computed again"
         set_job_state(tx, job.seq, JobState.cancelled, reason=Reason.cancelled, message=message)
 

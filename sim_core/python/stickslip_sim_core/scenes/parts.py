@@ -4,7 +4,7 @@ The document is `Physics` of stickslip_schemas.scene, as JSON, with arrays in pl
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -81,60 +81,20 @@ def sheet(
         ValueError: A value breaks its rule. The message begins with the place of the value.
     """
     place = f"sheets.{name}"
-    mesh, positions = _mesh(document["mesh"])
-    custom = materials.get(document["material"])
-    cloth_fabric = (
-        fabric(document["material"])
-        if custom is None
-        else fabric_of_card(document["material"], custom)
-    )
-    cloth_fabric = cloth_fabric.scaled(**document["factors"])
+    mesh, file_positions = _mesh(document["mesh"])
+    cloth_fabric = _fabric(document, materials)
     turn = rotation(document["turn"])
-    origin = np.array(document["origin"], float)
-    begin = document["start"]
-    # The flat sheet in its own axes, before the document turns and moves it.
-    local = np.column_stack([mesh.rest, np.zeros(len(mesh.rest))])
-    if begin["type"] == "stretched":
-        local[:, :2] = (1.0 + np.array(begin["strain"])) * mesh.rest
-    elif begin["type"] == "file":
-        # Positions come from the file of the start, or else from the file of the mesh.
-        if begin["file"] is not None:
-            positions = begin["file"]["positions"]
-        if positions is None or positions.shape != local.shape:
-            raise ValueError(
-                f"{place}.start.file: must have {len(local)} vertices, as the mesh has"
-            )
-        local = positions
-    start = local @ turn.T + origin
-    holders: dict[str, Holder] = {}
-    tracks: dict[str, Callable[[ArrayLike], Floats]] = {}
-    boxes: dict[str, Floats] = {}
-    last = 0.0
-    held_before = np.zeros(len(start), dtype=bool)
-    # In the order of names, so that results do not depend on the order in the document.
-    for key, holder in sorted(document["holders"].items()):
-        held = _held(mesh, holder, f"{place}.holders.{key}")
-        if (held & held_before).any():
-            raise ValueError(f"{place}.holders.{key}: must not hold what another holder holds")
-        held_before |= held
-        # A holder turns about the middle of its vertices, unless the document names a point.
-        middle = start[held].mean(axis=0)
-        motion = rigid_motion(holder["motion"], middle)
-        grasp = ALWAYS if holder["grasp"] is None else (holder["grasp"][0], holder["grasp"][1])
-        holders[key] = Holder(np.flatnonzero(held), motion.pose, grasp)
-        tracks[key] = _carried(motion, turn, middle)
-        boxes[key] = (
-            np.full(3, np.nan) if holder["rim"] else np.ptp((start[held] - middle) @ turn, axis=0)
-        )
-        last = max([last, motion.last, *(instant for instant in grasp if np.isfinite(instant))])
+    local = _local_start(document["start"], mesh, file_positions, place)
+    start = local @ turn.T + np.array(document["origin"], float)
+    grips = _grips(document["holders"], mesh, start, turn, place)
     # Holders take the hung cloth at its flat positions: `hung` does not move held vertices.
     hanging = None
-    if begin["type"] == "hung":
+    if document["start"]["type"] == "hung":
         hanging = hang(
             mesh,
             cloth_fabric,
             start,
-            np.flatnonzero(held_before),
+            np.flatnonzero(grips.held),
             normal=turn[:, 2],
             seed=seed,
             gravity=gravity,
@@ -148,11 +108,76 @@ def sheet(
         document["thickness"],
         start,
         hanging,
-        holders,
-        tracks,
-        boxes,
-        last,
+        grips.holders,
+        grips.tracks,
+        grips.boxes,
+        grips.last,
     )
+
+
+def _fabric(document: Document, materials: Document) -> Fabric:
+    """Return the fabric of a sheet: a custom one of `materials`, or a built-in one."""
+    name = document["material"]
+    card = materials.get(name)
+    whole = fabric(name) if card is None else fabric_of_card(name, card)
+    return whole.scaled(**document["factors"])
+
+
+def _local_start(
+    start: Document, mesh: meshes.Mesh, file_positions: Floats | None, place: str
+) -> Floats:
+    """Return the positions of a sheet in its own axes: (V, 3) [m].
+
+    The document turns and moves them afterwards. `file_positions` (V, 3) [m] are those of the file
+    of the mesh.
+    """
+    flat = np.column_stack([mesh.rest, np.zeros(len(mesh.rest))])
+    if start["type"] == "stretched":
+        flat[:, :2] = (1.0 + np.array(start["strain"])) * mesh.rest
+    if start["type"] != "file":
+        return flat
+    # Positions come from the file of the start, or else from the file of the mesh.
+    positions = file_positions if start["file"] is None else start["file"]["positions"]
+    if positions is None or positions.shape != flat.shape:
+        raise ValueError(f"{place}.start.file: must have {len(flat)} vertices, as the mesh has")
+    return positions
+
+
+@dataclass(eq=False)
+class _Grips:
+    """The holders of a sheet, with the attributes of `Sheet` of the same names."""
+
+    held: NDArray[np.bool_]
+    """Whether a holder holds a vertex: (V,)."""
+
+    last: float = 0.0
+    holders: dict[str, Holder] = field(default_factory=dict)
+    tracks: dict[str, Callable[[ArrayLike], Floats]] = field(default_factory=dict)
+    boxes: dict[str, Floats] = field(default_factory=dict)
+
+
+def _grips(
+    documents: Document, mesh: meshes.Mesh, start: Floats, turn: Floats, place: str
+) -> _Grips:
+    """Return the holders of a sheet that starts at `start` (V, 3) [m] with axes `turn` (3, 3)."""
+    grips = _Grips(np.zeros(len(start), dtype=bool))
+    # In the order of names, so that results do not depend on the order in the document.
+    for name, holder in sorted(documents.items()):
+        held = _held(mesh, holder, f"{place}.holders.{name}")
+        if (held & grips.held).any():
+            raise ValueError(f"{place}.holders.{name}: must not hold what another holder holds")
+        grips.held |= held
+        # A holder turns about the middle of its vertices, unless the document names a point.
+        middle = start[held].mean(axis=0)
+        motion = rigid_motion(holder["motion"], middle)
+        grasp = ALWAYS if holder["grasp"] is None else (holder["grasp"][0], holder["grasp"][1])
+        grips.holders[name] = Holder(np.flatnonzero(held), motion.pose, grasp)
+        grips.tracks[name] = _carried(motion, turn, middle)
+        sides = np.ptp((start[held] - middle) @ turn, axis=0)
+        grips.boxes[name] = np.full(3, np.nan) if holder["rim"] else sides
+        changes = [instant for instant in grasp if np.isfinite(instant)]
+        grips.last = max([grips.last, motion.last, *changes])
+    return grips
 
 
 def _mesh(document: Document) -> tuple[meshes.Mesh, Floats | None]:

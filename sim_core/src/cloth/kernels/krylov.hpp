@@ -110,7 +110,7 @@ inline void apply_contact(const ClothMatrix& matrix, const ContactRows& contact,
       const Node value = *(reinterpret_cast<const Node*>(v) + i);
       const float normal = dot3(n, *at);
       *at -= spread(normal) * n;
-      *at += spread(contact.turning[i]) * (value - spread(dot3(t, value)) * t) -
+      *at += spread(contact.turn_stiffness[i]) * (value - spread(dot3(t, value)) * t) -
              spread(contact.coupling[i] * normal) * t;
     }
   }
