@@ -107,10 +107,10 @@ class FactorPool {
   const Numbering& numbering_;
 };
 
-// The preconditioner while pairs are active: a factor with an order of its own, by nested
-// dissection in the space where the cloth is. In the plane at rest, layers of a fold would couple
-// everywhere. Nodes that stick to bodies couple nothing: sheets that lie on a floor do not hang
-// together through it.
+// The preconditioner while pairs are active (pair_factor.cpp): a factor with an order of its own,
+// by nested dissection in the space where the cloth is. In the plane at rest, layers of a fold
+// would couple everywhere. Nodes that stick to bodies couple nothing: sheets that lie on a floor do
+// not hang together through it.
 class PairFactor {
  public:
   PairFactor() = default;
@@ -127,12 +127,12 @@ class PairFactor {
                const ContactSet& pairs, double dt, const ClothSettings& settings);
 
  private:
-  // An active pair: w_a w_b stiffness for each two of its nodes, which are -1 where they are held
+  // An active pair: w_a w_b symmetric for each two of its nodes, which are -1 where they are held
   // or pinned.
   struct Entry {
     std::array<int, 4> node;
     std::array<float, 4> weight;
-    Eigen::Matrix3f stiffness;
+    Eigen::Matrix3f symmetric;
   };
   using Hold = Eigen::Matrix<float, 6, 1>;  // xx xy xz yy yz zz, N/m
 

@@ -1,4 +1,5 @@
-// The linear problem of an iteration: GMRES on stale factors, with the active set of contacts.
+// The linear problem of an iteration: GMRES on stale factors, with the active set of contacts. The
+// product of the matrix with a vector, friction included, is in kernels/krylov.hpp.
 #include <algorithm>
 #include <cmath>
 #include <limits>

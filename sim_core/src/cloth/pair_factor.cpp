@@ -48,7 +48,7 @@ void PairFactor::collect(const ContactSet& pairs, int free_nodes) {
       entry.node[c] = node < free_nodes && (pinned_.empty() || !pinned_[node]) ? node : -1;
       entry.weight[c] = static_cast<float>(pair.weights[c]);
     }
-    entry.stiffness = pair.row.symmetric.cast<float>();
+    entry.symmetric = pair.row.symmetric.cast<float>();
     wanted_.push_back(entry);
   }
 }
@@ -93,7 +93,7 @@ int PairFactor::missing(const ContactState& contact) const {
 }
 
 void PairFactor::add_holds(const Entry& entry, std::vector<Hold>& holds) {
-  const Eigen::Matrix3f& k = entry.stiffness;
+  const Eigen::Matrix3f& k = entry.symmetric;
   const Hold whole{k(0, 0), k(0, 1), k(0, 2), k(1, 1), k(1, 2), k(2, 2)};
   for (int c = 0; c < 4; ++c) {
     if (entry.node[c] >= 0) holds[entry.node[c]] += entry.weight[c] * entry.weight[c] * whole;
@@ -269,7 +269,7 @@ void PairFactor::make(const Assembly& assembly) {
       before.emplace_back(slot, std::array<float, 12>{});
       std::copy_n(block, 12, before.back().second.data());
       for (int c = 0; c < 3; ++c) {
-        for (int r = 0; r < 3; ++r) block[4 * c + r] += weight * entry.stiffness(r, c);
+        for (int r = 0; r < 3; ++r) block[4 * c + r] += weight * entry.symmetric(r, c);
       }
     });
   }

@@ -9,7 +9,8 @@
 
 namespace sim_core {
 
-// Rungs of the fallback ladder, see stepping.hpp.
+// Rungs of the fallback ladder, in the order in which they are tried; stepping.hpp has the table of
+// what each of them does.
 enum class Rung : int { attempt, plain, stiff_pairs, smoothed_law, persistent, best_iterate };
 
 constexpr std::array<const char*, 6> rung_names{"attempt",      "plain",      "stiff_pairs",
@@ -67,7 +68,7 @@ struct StepReport {
   double motion_error =
       0.0;  // m: distance of what drives the cloth from an even motion in a step of the controller
   double factorizations = 0.0;                       // whole ones, and shares of those in part
-  std::array<RungCount, rung_names.size()> rungs{};  // by Rung, rejected steps included
+  std::array<RungCount, rung_names.size()> rungs{};  // by Rung
   DiagnosticExtremes extremes;
 
   void count(Rung rung, bool solved) {

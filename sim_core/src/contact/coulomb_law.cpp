@@ -66,7 +66,8 @@ LawResponse slipping(const Contact& contact) {
   law.direction = direction_of(friction, contact.normal);
   law.normal_force = asked_normal(contact);
   law.bearing_force = std::max(contact.normal_force(), 0.0) + contact.pressed;
-  // Here mu enters: it bounds friction, and it couples friction to the normal force.
+  // Here mu enters the law: it bounds friction, and it couples friction to the normal force. How
+  // it enters the matrix stands at the head of coulomb_law.hpp.
   const double bound = contact.mu * law.bearing_force;
   law.friction = bound * law.direction;
   law.derivative = {1.0, 0.0, size > 0.0 ? std::min(bound / size, 1.0) : 0.0, contact.mu};

@@ -26,16 +26,18 @@
 //
 //     dP = a n (dr_N - k dg) + [b_t t t^T + b_s (1 - n n^T - t t^T)] (dr_T - k du) + c t dr_N
 //
-//              a    b_t    b_s              c
-//     open     0    0      0                0
-//     stick    1    1      1                0
-//     slip     1    0      mu (r_N + q)/|z_T|  mu
+//              a    b_t    b_s                   c
+//     open     0    0      0                     0
+//     stick    1    1      1                     0
+//     slip     1    0      mu (r_N + q)/|z_T|    mu
 //
-// The smoothed law has values between these. From here mu reaches the linear system by two ways,
-// both in linearized_contact.hpp: c couples friction to the normal force in the product of the
-// matrix (`NodeRow::coupling`, `PairRow::stiffness`), and b_s is a stiffness against a turn of
-// friction, which is symmetric and also enters what is factorised (`ContactState::factor_block` for
-// nodes, `PairFactor` for pairs).
+// The smoothed law has values between these. From here mu, the coefficient of friction, enters the
+// matrix by two ways, both in linearized_contact.hpp: c couples friction to the normal force
+// (`NodeRow::coupling`, `PairRow::stiffness` and `PairRow::force_by_normal`), and b_s is a
+// stiffness against a turn of friction (`NodeRow::turn_stiffness`). The product of the matrix with
+// a vector has both (`apply_contact` and `add_pairs` in cloth/kernels/krylov.hpp). Only the second
+// is symmetric, so it also enters what is factorised: `ContactState::factor_block` in state.cpp for
+// nodes, `PairRow::symmetric` in cloth/pair_factor.cpp for pairs.
 #pragma once
 
 #include <Eigen/Core>
@@ -51,7 +53,8 @@ struct Contact {
   Eigen::Vector3d normal;  // n, unit
   Eigen::Vector3d slip;    // u, m: since the start of the step, in the tangent plane
   Eigen::Vector3d force;   // r, N
-  double mu;               // coefficient of friction
+  double mu;               // coefficient of friction; of a node on a round body as corrected
+                           // for the size of the cell (`ContactState::mu_at`)
   double stiffness;        // k, N/m
   double pressed = 0.0;    // q, N: by what presses from the other side, where friction acts, too
 

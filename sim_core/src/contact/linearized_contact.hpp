@@ -1,5 +1,6 @@
-// How a contact enters the linear system of Newton's method. Both ways read the four derivatives of
-// the law (coulomb_law.hpp) and differ in what becomes of the contact's force.
+// How a contact enters the linear system of Newton's method: a contact of a node with a body or a
+// smooth surface (`NodeRow`), and a contact of a pair of closest points (`PairRow`). Both read the
+// four derivatives of the law (coulomb_law.hpp) and differ in what becomes of the contact's force.
 //
 // The linearized law r + dr = P + dP reads, in each direction d with derivative b,
 //

@@ -1,8 +1,9 @@
 """Leases that end without a result: they are returned, lost or expired, or the attempt failed.
 
-The loss of a worker does not count as a failed try. A task that had not been started does not count
-either. After the n-th failed try the task waits `retry_seconds` 2^(n-1), and after `max_tries`
-failed tries it fails for good.
+A task counts three things. `attempts`: how often it was leased and started. `tries`: attempts that
+failed; the loss of a worker is none. `losses`: workers that were lost while they ran the task. A
+task that had not been started counts nothing. After the n-th failed try the task waits
+`retry_seconds` 2^(n-1), and after `max_tries` failed tries it fails for good.
 
 A task that ended its process each time is quarantined, and the jobs that need it continue with
 everything else. Any other failure ends all jobs that need the task. These jobs start no further

@@ -286,7 +286,8 @@ def settle_jobs(tx: QueueTransaction) -> None:
 def settle_job(tx: QueueTransaction, job: int) -> None:
     """End the transition of a job that was just paused or cancelled.
 
-    It waits while a worker has a task on lease, started or not, that only this job needs.
+    It waits while a worker has a task on lease that only this job needs: a started one until it
+    ends, another one until the next heartbeat returns it.
     """
     for waiting in _WAITING_JOBS.rows(tx.connection):
         if waiting.seq == job:

@@ -13,7 +13,10 @@ _COLUMNS = ("duration", "contact_work", "flow", "unconverged", "motion_error")
 
 
 class StepHistory:
-    """One row of measured numbers for each step."""
+    """One row of measured numbers for each step.
+
+    The rungs of the fallback ladder are not among them: `Cloth.total` has their sum.
+    """
 
     def __init__(self) -> None:
         self._steps = 0

@@ -353,7 +353,9 @@ class Cloth:
         are the bodies at the end, and surfaces are taken there, too. `damping` is proportional to
         mass [1/s] and adds to the damping of the fabric.
 
-        The solver counts a step that does not converge, and keeps its best iterate.
+        The solver counts a step that does not converge, and keeps its best iterate. `rungs` of the
+        report says how often each rung of the fallback ladder was tried and how often it converged:
+        parts of a step may end on different rungs.
         """
         ends = np.asarray(held, float).reshape(-1, 3)
         report = self._solver.step(
