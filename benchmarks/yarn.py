@@ -1,12 +1,13 @@
 """Bending lengths of photographed yarn over the edge of a table, by the fits of this project.
 
-python benchmarks/yarn.py CENTRELINES.csv [--tilt]
+python benchmarks/yarn.py CENTRELINES.csv [--thickness MM]
 
 The file has the columns photo, length_mm, s_mm, x_mm and z_mm: points along each yarn, x away from
 the table and z up. One yarn has one bending length, however long it hangs: L / gamma^(1/3) must be
 the same for all lengths. Singal et al. 2024 (Nature Communications 15, 2622) publish such
-photographs. With --tilt, the tilt of the clamp is fitted, too. The last lines say whether each
-centreline is refused with a clamp along gravity.
+photographs. Each is measured as `stickslip rods measure` does, with the tilt of the clamp fitted
+and a roll of the camera that nobody measured. The last line says how many centrelines are refused
+with a clamp along gravity.
 """
 
 import argparse
@@ -14,64 +15,77 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from stickslip_sim_core import ParameterFit, fit_parameters, fit_tilted_clamp
-
-LEVEL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-"""Columns d1 = x (away from the table), d2 = z (up), d3 = -y (across the photograph)."""
+from stickslip_sim_core import fit_parameters
+from stickslip_sim_core.photographs.bending import (
+    UNKNOWN_ROLL,
+    Bending,
+    joint_bending,
+    measure_centerline,
+)
 
 
 def centerlines(path: Path) -> dict[str, tuple[float, NDArray[np.float64]]]:
-    """Return the length [mm] and the centreline (P, 3) [L] of each photograph."""
+    """Return the length [mm] and the centreline (P, 2) [mm] of each photograph."""
     points = np.genfromtxt(path, delimiter=",", names=True, dtype=None, encoding="utf-8")
     rods = {}
     for photo in dict.fromkeys(points["photo"]):
         rod = points[points["photo"] == photo]
         length = float(rod["s_mm"][-1])
-        plane = np.stack([rod["x_mm"], np.zeros(len(rod)), rod["z_mm"]], axis=1)
-        rods[str(photo)] = (length, plane / length)
+        rods[str(photo)] = (length, np.stack([rod["x_mm"], rod["z_mm"]], axis=1))
     return rods
 
 
-def is_refused(centerline: NDArray[np.float64]) -> bool:
+def is_refused(length: float, points: NDArray[np.float64]) -> bool:
     """Return whether the fit refuses a centreline with the clamp of a hanging rod."""
+    x, z = points.T / length
     try:
-        fit_parameters(centerline)
+        fit_parameters(np.stack([x, 0.0 * x, z], axis=1))
     except ValueError:
         return True
     return False
 
 
-def fitted(centerline: NDArray[np.float64], *, with_tilt: bool) -> tuple[ParameterFit, str]:
-    """Return the fit of a centreline, and the fitted tilt of its clamp in words."""
-    if not with_tilt:
-        return fit_parameters(centerline, phi0=0.0, clamp_frame=LEVEL), ""
-    fit = fit_tilted_clamp(centerline, phi0=0.0, clamp_frame=LEVEL)
-    tilt, error = np.degrees([fit.tilt, fit.tilt_error])
-    return fit.rod, f", tilt {tilt:5.1f} +- {error:.1f} degrees"
+def print_photograph(photo: str, bending: Bending) -> None:
+    """Print the result of a photograph, and the parts of its error."""
+    tilt = np.degrees(bending.clamp_angle)
+    print(
+        f"{photo:6} bending length {bending.bending_length:4.1f} +- "
+        f"{bending.bending_length_error:4.1f} mm (ledge {bending.change_at_ledge:+5.1f}, roll "
+        f"{bending.change_by_roll:+5.1f}), natural bend {bending.natural_bend:5.1f} +- "
+        f"{bending.natural_bend_error:4.1f} /m, tilt {tilt:5.1f} degrees, residual "
+        f"{1e3 * bending.residual / bending.length:4.2f}e-3 L"
+        f"{', bend for weight' * bending.trades_bend_for_weight}",
+        flush=True,
+    )
+
+
+def print_lengths(measured: dict[float, list[Bending]]) -> None:
+    """Print the bending length of each length, and of all photographs together."""
+    for length, bendings in measured.items():
+        joint = joint_bending(bendings)
+        mean = np.mean([bending.bending_length for bending in bendings])
+        print(
+            f"{length:4.0f} mm long: mean {mean:.1f} mm, weighted {joint.bending_length:.1f} +- "
+            f"{joint.error:.1f} mm, scatter {joint.scatter:.1f} mm"
+        )
+    joint = joint_bending([bending for bendings in measured.values() for bending in bendings])
+    print(f"all: bending length {joint.bending_length:.1f} +- {joint.error:.1f} mm")
 
 
 def main() -> None:
     """Print the fit of each photograph, and the mean of each length."""
     parser = argparse.ArgumentParser(description="Bending lengths of photographed yarn.")
     parser.add_argument("file", type=Path)
-    parser.add_argument("--tilt", action="store_true", help="fit the tilt of the clamp, too")
+    parser.add_argument("--thickness", type=float, default=2.0, help="of the yarn [mm]")
     options = parser.parse_args()
     rods = centerlines(options.file)
-    bending_lengths: dict[float, list[float]] = {}
-    for photo, (length, centerline) in rods.items():
-        # A photograph does not show twist.
-        fit, tilt = fitted(centerline, with_tilt=options.tilt)
-        bending_length = length / fit.gamma ** (1 / 3)
-        bending_lengths.setdefault(round(length, -1), []).append(bending_length)
-        print(
-            f"{photo:6} gamma {fit.gamma:6.0f} +- {fit.standard_error[0]:4.0f}, natural bend "
-            f"{fit.phi1:5.2f} /L, residual {1e3 * fit.residual:5.2f}e-3 L, bending length "
-            f"{bending_length:4.1f} mm{tilt}{', bend for weight' * fit.trades_bend_for_weight}"
-        )
-    for length, values in bending_lengths.items():
-        mean = np.mean(values)
-        print(f"{length:4.0f} mm long: bending length {mean:.1f} +- {np.std(values):.1f} mm")
-    refused = sum(is_refused(centerline) for _, centerline in rods.values())
+    measured: dict[float, list[Bending]] = {}
+    for photo, (length, points) in rods.items():
+        bending = measure_centerline(points, options.thickness, roll_error=UNKNOWN_ROLL)
+        measured.setdefault(round(length, -1), []).append(bending)
+        print_photograph(photo, bending)
+    print_lengths(measured)
+    refused = sum(is_refused(length, points) for length, points in rods.values())
     print(f"{refused} of {len(rods)} are refused with a clamp along gravity")
 
 

@@ -83,6 +83,12 @@ def _parser() -> argparse.ArgumentParser:
     fit.add_argument("--request", required=True, help="parameters and options as JSON")
     fit.set_defaults(run=_fit)
 
+    rods = commands.add_parser(
+        "rods", help="measure threads in photographs, as `stickslip rods measure` asks for it"
+    )
+    rods.add_argument("request", type=json.loads, help="photographs and options as JSON")
+    rods.set_defaults(run=_rods)
+
     describe = commands.add_parser("describe", help="print the builds of this environment")
     describe.set_defaults(run=_describe)
     return parser
@@ -313,6 +319,28 @@ def _lab(options: argparse.Namespace) -> int:
 
     try:
         answer = run_test(json.loads(options.request.read_text(encoding="utf-8")))
+    except (ValueError, OSError) as error:
+        sys.stderr.write(f"error: {error}\n")
+        return 2
+    sys.stdout.write(json.dumps(answer) + "\n")
+    return 0
+
+
+def _rods(options: argparse.Namespace) -> int:
+    """Return 0 if the photographs were measured, and 2 if not."""
+    try:
+        from stickslip_workers.photographs import measure_photographs
+    except ModuleNotFoundError as error:
+        # A module of an installed package is a bug, and no missing extra.
+        if error.name not in ("cv2", "scipy"):
+            raise
+        sys.stderr.write(
+            f"error: photographs need OpenCV and SciPy, and {error.name} is not installed: run "
+            "`pip install './sim_core[photographs]'`\n"
+        )
+        return 2
+    try:
+        answer = measure_photographs(options.request)
     except (ValueError, OSError) as error:
         sys.stderr.write(f"error: {error}\n")
         return 2

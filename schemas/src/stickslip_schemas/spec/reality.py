@@ -40,6 +40,8 @@ class YarnFit(NamedTuple):
     """Overhanging length [mm]."""
     bending_length: float
     """[mm]."""
+    error: float
+    """Standard deviation of the bending length [mm]."""
 
 
 class MeasuredFabric(NamedTuple):
@@ -104,10 +106,10 @@ def reality() -> Reality:
     text = files("stickslip_schemas").joinpath("fabrics", "reality.toml").read_text("utf-8")
     table = tomllib.loads(text)
     yarn = table["yarn"]
-    pairs = zip(yarn["length_mm"], yarn["bending_length_mm"], strict=True)
+    columns = (yarn["length_mm"], yarn["bending_length_mm"], yarn["error_mm"])
     return Reality(
         date=table["date"],
-        yarn=tuple(YarnFit(length, bending_length) for length, bending_length in pairs),
+        yarn=tuple(YarnFit(*row) for row in zip(*columns, strict=True)),
         yarn_source=yarn["source"],
         yarn_meaning=yarn["meaning"],
         drape_source=table["drape"]["source"],

@@ -33,6 +33,7 @@ _SECTIONS = {
     ),
     "Datasets": dict.fromkeys(("datasets", "pull", "verify", "sign", "export"), "datasets"),
     "Scenes": {"scene": "specs", "simulate": "specs", "fit": "fitting"},
+    "Rods": {"rods": "rods"},
     "Fabrics": dict.fromkeys(("fabrics", "lab"), "laboratory"),
     "Certificates": dict.fromkeys(("certify", "register", "certificates"), "workers"),
     "Measurement": {"measure": "measuring"},

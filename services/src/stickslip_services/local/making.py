@@ -202,6 +202,18 @@ def run_lab(request: Mapping[str, Any]) -> dict[str, Any]:
         return _workers(["lab", str(path)], "the fabric was not tested")
 
 
+def measure_photographs(request: Mapping[str, Any]) -> dict[str, Any]:
+    """Measure threads in photographs, and return the result; raise CommandError.
+
+    The request is that of the workers' program.
+    """
+    for name in request["photographs"]:
+        if not Path(name).is_file():
+            raise CommandError(f"there is no file {name}")
+    refusal = "the photographs were not measured"
+    return _workers(["rods", json.dumps(request)], refusal)
+
+
 def why_uncertified(spec: ClothSceneSpec, certificate: Certificate | None, build: str) -> str:
     """Return why no certificate vouches for the samples of a spec, or an empty text.
 

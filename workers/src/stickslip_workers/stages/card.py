@@ -185,7 +185,7 @@ def _compared_cloth(facts: Reality) -> list[str]:
 
 
 def _compared_rods(facts: Reality) -> list[str]:
-    rows = [(f"{fit.length:g}", f"{fit.bending_length:g}") for fit in facts.yarn]
+    rows = [(f"{fit.length:g}", f"{fit.bending_length:g} +- {fit.error:g}") for fit in facts.yarn]
     return [
         _table(("overhang of a yarn [mm]", "fitted bending length [mm]"), rows),
         f"Source: {facts.yarn_source}; {facts.yarn_meaning}.",
