@@ -17,12 +17,14 @@ the cost, and how many medians are within 1.6 times.
 import argparse
 import json
 import os
+import sys
 import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
 import httpx
+from stickslip_workers.machine import QUIET_SECONDS, SpeedGauge, speed_file
 from thesis_job import service
 
 
@@ -203,6 +205,15 @@ def summarize(results: list[dict[str, Any]]) -> dict[str, Any]:
     return summary
 
 
+def know_machine() -> None:
+    """Measure the speed of this machine while nothing disturbs it, as an idle worker does."""
+    gauge = SpeedGauge(speed_file(), os.cpu_count() or 1)
+    while not gauge.is_settled:
+        print("waiting for quiet CPUs", file=sys.stderr)
+        time.sleep(QUIET_SECONDS)
+        gauge.settle()
+
+
 def wait_for_workers(client: httpx.Client) -> None:
     """Wait until a worker is ready; its first seconds are no part of a job."""
     while True:
@@ -223,6 +234,7 @@ def main() -> None:
     jobs = SETS[options.set]
     indices = list(range(len(jobs)) if options.only is None else options.only)
     results = []
+    know_machine()
     # Each turn starts a service, and runs the jobs of which it has measured no cost.
     while indices:
         with tempfile.TemporaryDirectory() as folder, service(Path(folder), options.port) as client:

@@ -171,11 +171,15 @@ def test_a_worker_is_ready_once_the_speed_of_its_machine_is_known(
     """Otherwise, the first estimates would be those of another machine."""
     is_measured = threading.Event()
 
-    def machine_speed(_file: Path, _slots: int) -> MachineSpeed:
-        is_measured.wait(60.0)
-        return MachineSpeed(cpu_speed=0.5)
+    class Gauge:
+        def __init__(self, _file: Path, _slots: int) -> None:
+            is_measured.wait(60.0)
+            self.speed = MachineSpeed(cpu_speed=0.5)
 
-    monkeypatch.setattr(dispatcher, "machine_speed", machine_speed)
+        def settle(self) -> bool:
+            return False
+
+    monkeypatch.setattr(dispatcher, "SpeedGauge", Gauge)
     start()
     double.until(lambda: "the speed of this machine" in double.condition.reason)
     assert double.condition.state == "starting"

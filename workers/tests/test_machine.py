@@ -3,6 +3,7 @@
 import json
 import logging
 import subprocess
+import time
 from pathlib import Path
 
 import pytest
@@ -11,13 +12,29 @@ from stickslip_workers import machine
 
 
 @pytest.fixture
-def measurements(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+def other_share(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Replace the meter; its only element is the share of the CPUs that other programs use."""
+    share = [0.0]
+
+    class Meter:
+        seconds = 10.0
+
+        @property
+        def other_share(self) -> float:
+            return share[0]
+
+    monkeypatch.setattr(machine, "CpuMeter", Meter)
+    return share
+
+
+@pytest.fixture
+def measurements(monkeypatch: pytest.MonkeyPatch, other_share: list[float]) -> list[int]:
     """Replace the drag; collect the number of processes of each measurement."""
     calls: list[int] = []
 
     def measure_speed(processes: int) -> MachineSpeed:
         calls.append(processes)
-        return MachineSpeed(cpu_speed=0.5, cpu_available=0.25)
+        return MachineSpeed(cpu_speed=0.5 / (1.0 + other_share[0]), cpu_available=0.25)
 
     monkeypatch.setattr(machine, "measure_speed", measure_speed)
     return calls
@@ -25,19 +42,54 @@ def measurements(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 def test_a_measured_speed_is_stored(tmp_path: Path, measurements: list[int]) -> None:
     file = tmp_path / "cache" / "speed.json"
-    first = machine.machine_speed(file, slots=16)
-    assert first == MachineSpeed(cpu_speed=0.5, cpu_available=0.25)
-    assert machine.machine_speed(file, slots=16) == first
+    first = machine.SpeedGauge(file, slots=16)
+    assert first.speed == MachineSpeed(cpu_speed=0.5, cpu_available=0.25)
+    assert first.is_settled
+    assert machine.SpeedGauge(file, slots=16).speed == first.speed
     assert measurements == [machine.MAX_PROCESSES]
+
+
+def test_a_disturbed_speed_is_measured_again_once_the_cpus_are_quiet(
+    tmp_path: Path, measurements: list[int], other_share: list[float]
+) -> None:
+    file = tmp_path / "speed.json"
+    other_share[0] = 1.0
+    gauge = machine.SpeedGauge(file, slots=2)
+    assert gauge.speed.cpu_speed == 0.25
+    assert not gauge.settle()
+    assert not file.exists()
+    # Another start does not take the disturbed speed over.
+    assert machine.SpeedGauge(file, slots=2).speed.cpu_speed == 0.25
+    assert len(measurements) == 2
+    other_share[0] = 0.5 * machine.QUIET_SHARE
+    assert gauge.settle()
+    assert gauge.speed.cpu_speed == pytest.approx(0.5, rel=0.06)
+    assert file.exists()
+    assert not gauge.settle()
+    assert len(measurements) == 3
+
+
+def test_others_on_the_cpus_are_seen() -> None:
+    """A program that is not a child that has ended takes a CPU."""
+    busy = subprocess.Popen([machine.sys.executable, "-c", "while True: pass"])
+    try:
+        meter = machine.CpuMeter()
+        time.sleep(1.0)
+        assert meter.seconds >= 1.0
+        # The child has a CPU, or a good part of one if many programs run.
+        assert meter.other_share > 0.3 / (machine.os.cpu_count() or 1)
+    finally:
+        busy.kill()
+        busy.wait()
 
 
 def test_other_cpus_are_measured_again(
     tmp_path: Path, measurements: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = tmp_path / "speed.json"
-    machine.machine_speed(file, slots=1)
+    machine.SpeedGauge(file, slots=1)
     monkeypatch.setattr(machine, "machine_name", lambda: "another CPU")
-    machine.machine_speed(file, slots=1)
+    machine.SpeedGauge(file, slots=1)
     assert measurements == [1, 1]
 
 
@@ -47,7 +99,7 @@ def test_a_damaged_file_is_measured_again_with_a_warning(
 ) -> None:
     file = tmp_path / "speed.json"
     file.write_bytes(content)
-    machine.machine_speed(file, slots=1)
+    machine.SpeedGauge(file, slots=1)
     assert measurements == [1]
     assert "is not the speed of a machine" in caplog.text
 
@@ -60,7 +112,7 @@ def test_a_machine_that_cannot_be_measured_is_the_reference_machine(
 
     monkeypatch.setattr(machine, "measure_speed", measure_speed)
     with caplog.at_level(logging.WARNING):
-        assert machine.machine_speed(tmp_path / "speed.json", slots=2) == MachineSpeed()
+        assert machine.SpeedGauge(tmp_path / "speed.json", slots=2).speed == MachineSpeed()
     assert "the speed of this machine is unknown" in caplog.text
     assert not (tmp_path / "speed.json").exists()
 

@@ -10,6 +10,10 @@ was measured. Three numbers convert them to another machine:
 The last two are below 1 if a quota or other programs leave less than a CPU to a process. Under a
 quota of one CPU, a process that runs alone has all of it, and each of two has half.
 
+Other programs spoil a measurement: they take CPUs, and the drag itself needs more CPU time beside
+them. A worker is often measured while Ray starts. So a speed is only kept if the CPUs were quiet,
+and until then the worker measures again when it is idle (`SpeedGauge`).
+
     python -m stickslip_workers.machine     runs the drag and prints its times as JSON
 """
 
@@ -17,6 +21,7 @@ import json
 import logging
 import os
 import platform
+import resource
 import subprocess
 import sys
 import time
@@ -47,6 +52,15 @@ MAX_PROCESSES = 2
 
 A quota shows with two, and the measurement stays below 2 CPU s.
 """
+
+QUIET_SHARE = 0.1
+"""Share of all CPUs that other programs may use during a measurement that is kept.
+
+While Ray and other programs used two CPUs of two, the drag took three times its CPU time.
+"""
+
+QUIET_SECONDS = 2.0
+"""Time for which the CPUs are quiet before a speed is measured again [s]: twice a measurement."""
 
 TIMEOUT_SECONDS = 60.0
 """Limit of the drag [s]. A slower machine is not measured."""
@@ -132,31 +146,119 @@ def speed_file() -> Path:
     return Path(cache) / "stickslip" / "machine-speed.json"
 
 
-def machine_speed(file: Path, slots: int) -> MachineSpeed:
-    """Return the speed of this machine, from `file` or from a measurement.
+class SpeedGauge:
+    """The speed of this machine, from a file or measured; measured again if it was disturbed.
 
     A machine that cannot be measured counts as the reference machine, and the log gives the reason.
     """
-    name = machine_name()
+
+    def __init__(self, file: Path, slots: int) -> None:
+        self._file = file
+        self._processes = min(slots, MAX_PROCESSES)
+        self._machine = machine_name()
+        self._meter = CpuMeter()
+        stored = self._read()
+        self.is_settled = stored is not None
+        """Whether the speed needs no further measurement."""
+        self.speed = stored or self._measure()
+
+    def settle(self) -> bool:
+        """Measure a disturbed speed again if the CPUs have been quiet; return whether it did so.
+
+        It takes a second, so call it when nothing else waits.
+        """
+        if self.is_settled or self._meter.seconds < QUIET_SECONDS:
+            return False
+        was_quiet = self._meter.other_share <= QUIET_SHARE
+        if was_quiet:
+            self.speed = self._measure()
+        self._meter = CpuMeter()
+        return was_quiet
+
+    def _read(self) -> MachineSpeed | None:
+        """Return the stored speed of this machine."""
+        try:
+            stored = StoredSpeed.model_validate_json(self._file.read_bytes())
+        except FileNotFoundError:
+            return None
+        except (OSError, ValidationError) as error:
+            log.warning(
+                "%s is not the speed of a machine, and is measured again: %s", self._file, error
+            )
+            return None
+        return stored.speed if stored.machine == self._machine else None
+
+    def _measure(self) -> MachineSpeed:
+        """Measure the speed, and store it if other programs left the CPUs alone."""
+        meter = CpuMeter()
+        try:
+            speed = measure_speed(self._processes)
+        except (OSError, subprocess.SubprocessError) as error:
+            log.warning("the speed of this machine is unknown: %s", error)
+            self.is_settled = True
+            return MachineSpeed()
+        other_share = meter.other_share
+        self.is_settled = other_share <= QUIET_SHARE
+        if self.is_settled:
+            self._store(speed)
+        else:
+            log.info(
+                "other programs used %.0f %% of the CPUs while the speed of this machine was "
+                "measured; it is measured again when they rest",
+                100 * other_share,
+            )
+        return speed
+
+    def _store(self, speed: MachineSpeed) -> None:
+        document = StoredSpeed(machine=self._machine, speed=speed)
+        try:
+            self._file.parent.mkdir(parents=True, exist_ok=True)
+            self._file.write_text(document.model_dump_json(), encoding="utf-8")
+        except OSError as error:
+            log.warning("the speed of this machine cannot be stored: %s", error)
+
+
+class CpuMeter:
+    """The share of all CPUs that other programs use, from the construction of the meter on."""
+
+    def __init__(self) -> None:
+        self._started_at = time.monotonic()
+        self._busy_before = _busy_seconds()
+        self._own_before = _own_seconds()
+
+    @property
+    def seconds(self) -> float:
+        """Time since the construction [s]."""
+        return time.monotonic() - self._started_at
+
+    @property
+    def other_share(self) -> float:
+        """CPU time of others over that of all CPUs; 0 on systems that do not tell it.
+
+        The ended children of this process are not others.
+        """
+        own_seconds = _own_seconds() - self._own_before
+        busy_seconds = _busy_seconds() - self._busy_before
+        return max(0.0, busy_seconds - own_seconds) / (self.seconds * (os.cpu_count() or 1))
+
+
+def _own_seconds() -> float:
+    """Return the CPU time of this process and of its children that have ended [s]."""
+    usages = (
+        resource.getrusage(group) for group in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    )
+    return sum(usage.ru_utime + usage.ru_stime for usage in usages)
+
+
+def _busy_seconds() -> float:
+    """Return the time for which all CPUs together were busy since the start of the system [s]."""
     try:
-        stored = StoredSpeed.model_validate_json(file.read_bytes())
-        if stored.machine == name:
-            return stored.speed
-    except FileNotFoundError:
-        pass
-    except (OSError, ValidationError) as error:
-        log.warning("%s is not the speed of a machine, and is measured again: %s", file, error)
-    try:
-        speed = measure_speed(min(slots, MAX_PROCESSES))
-    except (OSError, subprocess.SubprocessError) as error:
-        log.warning("the speed of this machine is unknown: %s", error)
-        return MachineSpeed()
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(StoredSpeed(machine=name, speed=speed).model_dump_json(), encoding="utf-8")
-    except OSError as error:
-        log.warning("the speed of this machine cannot be stored: %s", error)
-    return speed
+        first_line = Path("/proc/stat").read_text(encoding="ascii").splitlines()[0]
+    except OSError:  # the system is not Linux
+        return 0.0
+    # proc_stat(5): user, nice, system, idle, iowait, irq, softirq, steal, in ticks.
+    user, nice, system, _idle, _iowait, irq, softirq, steal = map(int, first_line.split()[1:9])
+    return (user + nice + system + irq + softirq + steal) / os.sysconf("SC_CLK_TCK")
 
 
 def measure_speed(processes: int) -> MachineSpeed:
