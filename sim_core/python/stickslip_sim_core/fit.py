@@ -3,34 +3,61 @@
 The residual is that of the observations over their noise, and its Jacobian has the derivatives of
 the run by the parameters. `scipy.optimize.least_squares` finds a minimum. A residual may have
 several: cloth that falls to another side is another branch. A fit therefore goes on from other
-starts until the observations are explained by their noise, and says how many minima it saw. SciPy
-comes with the extra `fit`.
+starts until the observations are explained by their noise, and says how many minima it saw.
+
+A run also depends on the steps that its solver chooses. They are others at each value, so that the
+residual has small jumps. A search ends where the linear model of the residual has no better values
+within the noise, and not where the jumps end. A last run with finer steps says how far steps move
+the values, and the standard deviations have this share. SciPy comes with the extra `fit`.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.cloth.presets import SolverSettings
 from stickslip_sim_core.scenes.family import SceneFamily
 from stickslip_sim_core.scenes.scene import ClothRun
 
 LEAST_FRACTION = 1e-3
 """Least value of a parameter that may be 0, over its largest: its logarithm needs a bound."""
 
-EXPLAINED = 1.5
-"""Mean squared residual over the noise, up to which the noise explains the observations."""
+CHANCE = 5.0
+"""Standard deviations of a mean square by which chance alone may raise it above 1.
+
+The mean of n squares has the standard deviation sqrt(2/n).
+"""
 
 SAME_MINIMUM = 0.02
 """Relative difference of all parameters within which two starts ended in one minimum."""
 
 TOLERANCE = 1e-5
-"""Relative change of the residual's square and of the values at which a search has converged.
+"""Relative change of the residual's square and of the values at which a search ends anyhow.
 
 It is far below what noise decides on.
 """
+
+NEAR = 0.1
+"""Distance to the minimum of the linear model at which a search has converged.
+
+Its unit is the standard deviation by the noise. A nearer point is no better known.
+"""
+
+AT_BOUND = 2e-3
+"""Relative distance from a bound within which a value is held by the bound."""
+
+FINER = 4.0
+"""Factor of the step error between a run and the one that tells what its steps do.
+
+The error of a step grows with the square of its length, so steps are half as long.
+"""
+
+STEPS_SHARE = 2.0
+"""Error of a run over its difference from one with steps half as long, for first order in time."""
 
 RUNS_MAX = 15
 """Runs from one start: a smooth residual takes 7 to 13.
@@ -38,6 +65,16 @@ RUNS_MAX = 15
 Where the residual jumps, a search creeps from one jump to the next, and may end many standard
 deviations off with a residual that noise could explain.
 """
+
+
+class Compared(NamedTuple):
+    """A run compared with observations."""
+
+    residual: Floats
+    """Difference of run and observation over the noise: (N,)."""
+
+    jacobian: Floats
+    """Derivatives of the residual by each parameter: (N, P)."""
 
 
 class Observation(Protocol):
@@ -52,12 +89,8 @@ class Observation(Protocol):
         """Check that the observation fits a run; raise ValueError."""
         ...
 
-    def residual(self, run: ClothRun) -> Floats:
-        """Return the difference of run and observation over the noise: (N,)."""
-        ...
-
-    def jacobian(self, run: ClothRun, derivative: Floats) -> Floats:
-        """Return the derivative of the residual, from that of positions (frames, V, 3): (N,)."""
+    def compare(self, run: ClothRun, derivatives: Sequence[Floats]) -> Compared:
+        """Return the residual, and its derivatives from those of positions (frames, V, 3)."""
         ...
 
 
@@ -70,12 +103,10 @@ class Minimum(NamedTuple):
     """Mean squared residual over the noise, or inf if no run from the start is valid."""
     runs: int
     converged: bool
+    """Whether no better values are within reach of the linear model: see `NEAR`."""
+    is_explained: bool
+    """Whether the search converged, and noise explains what the run leaves."""
     message: str
-
-    @property
-    def is_explained(self) -> bool:
-        """Whether the search converged, and noise explains what the run leaves."""
-        return self.converged and self.mean_square <= EXPLAINED
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,14 +116,24 @@ class Fit:
     values: Mapping[str, float]
     """Of the best minimum."""
 
-    deviations: Mapping[str, float]
-    """Standard deviations of the values, by the noise of the observations.
+    covariance: Floats
+    """Of the values (P, P), in their order: that by the noise, and that by the steps.
 
-    They are those of one branch of the run: a value in another branch may be off by far more.
+    It is that of one branch of the run: a value in another branch may be off by far more.
     """
 
-    covariance: Floats
-    """Of the values (P, P), in their order."""
+    by_noise: Mapping[str, float]
+    """Standard deviations of the values by the noise of the observations.
+
+    Where the residual is larger than the noise, they are as much larger.
+    """
+
+    by_steps: Mapping[str, float]
+    """How far the values may be off by the run's steps in time, or NaN.
+
+    It is the change of the minimum with steps half as long, to first order, times `STEPS_SHARE`.
+    It is NaN where that run is not valid.
+    """
 
     mean_square: float
     """Mean squared residual over the noise: 1 if noise alone is left."""
@@ -103,8 +144,17 @@ class Fit:
     searches: Sequence[Minimum]
     """Where the search from each start ended."""
 
+    is_explained: bool
+    """Whether that search converged, and noise explains what the run leaves."""
+
     minima: int
     """Number of different minima among them."""
+
+    @property
+    def deviations(self) -> Mapping[str, float]:
+        """Standard deviations of the values."""
+        deviations = np.sqrt(np.diag(self.covariance)).tolist()
+        return dict(zip(self.values, deviations, strict=True))
 
     @property
     def runs(self) -> int:
@@ -115,17 +165,22 @@ class Fit:
     def warning(self) -> str:
         """Why the values may be wrong, or an empty text."""
         counted = f"the searches from {len(self.searches)} starts ended in {self.minima} minima"
-        if self.mean_square > EXPLAINED:
-            return (
-                f"several minima: {counted}, and the best leaves a residual of "
-                f"{self.mean_square**0.5:.2g} times the noise. Give other starts or more of them"
-            )
+        several = f"several minima: {counted}, and " if self.minima > 1 else ""
         if not self.converged:
             return (
-                f"several minima: {counted}, and the best search did not converge in {RUNS_MAX} "
-                "runs: the residual jumps between near values"
+                f"{several or f'{counted}: '}the best search did not converge: the residual jumps "
+                f"between near values, or {RUNS_MAX} runs are too few"
             )
-        return f"several minima: {counted}; noise explains the best" if self.minima > 1 else ""
+        if not self.is_explained:
+            return (
+                f"{several or f'{counted}: '}the best leaves a residual of "
+                f"{self.mean_square**0.5:.3g} times the noise. Give other starts or more of them, "
+                "or check the noise"
+            )
+        unsure = [name for name, shift in self.by_steps.items() if not np.isfinite(shift)]
+        if unsure:
+            return "the run with finer steps is not valid: deviations leave out errors of steps"
+        return f"several minima: {counted}; noise explains the best" if several else ""
 
 
 def fit(
@@ -151,9 +206,11 @@ def fit(
         seed: Seed of the starts.
 
     Raises:
+        ImportError: SciPy is missing.
         ValueError: An argument breaks its rule, there are fewer observations than parameters, a
             parameter has no effect, or no start has a valid run.
     """
+    check_scipy()
     search = _Search(scenes, observations, parameters, bounds or {})
     starts = search.starts(start or {}, multistart, seed)
     searches: list[Minimum] = []
@@ -165,17 +222,30 @@ def fit(
     best = min(searches, key=lambda minimum: (not minimum.is_explained, minimum.mean_square))
     if not np.isfinite(best.mean_square):
         raise ValueError(f"start: no run is valid from any of them: {best.message}")
-    covariance = search.covariance(best.values)
-    deviations = np.sqrt(np.diag(covariance))
+    by_noise = search.covariance(best)
+    by_steps = search.shift_by_steps(best)
+    covariance = by_noise + np.nan_to_num(np.outer(by_steps, by_steps))
     return Fit(
         best.values,
-        dict(zip(parameters, deviations.tolist(), strict=True)),
         covariance,
+        dict(zip(parameters, np.sqrt(np.diag(by_noise)).tolist(), strict=True)),
+        dict(zip(parameters, np.abs(by_steps).tolist(), strict=True)),
         best.mean_square,
         best.converged,
         searches,
+        best.is_explained,
         _count_minima(searches),
     )
+
+
+def check_scipy() -> None:
+    """Check that SciPy is there.
+
+    Raises:
+        ImportError: It is missing; the message has the way to install it.
+    """
+    if find_spec("scipy") is None:
+        raise ImportError("a fit needs SciPy: run `pip install 'stickslip-sim-core[fit]'`")
 
 
 def _count_minima(searches: Sequence[Minimum]) -> int:
@@ -270,7 +340,7 @@ class _Search:
         runs_before = len(self._runs)
         first = self._run(start)
         if first.reason:
-            return Minimum(start, start, np.inf, 1, False, first.reason)
+            return Minimum(start, start, np.inf, 1, False, False, first.reason)
         without = [
             name for name, by in zip(self._names, first.jacobian.T, strict=True) if not by.any()
         ]
@@ -286,17 +356,41 @@ class _Search:
             xtol=TOLERANCE,
             ftol=TOLERANCE,
             max_nfev=RUNS_MAX,
+            callback=self._stop_near,
         )
-        mean_square = 2.0 * float(solution.cost) / max(self._count - len(self._names), 1)
-        runs = len(self._runs) - runs_before
+        freedom = max(self._count - len(self._names), 1)
+        mean_square = 2.0 * float(solution.cost) / freedom
+        converged = self._is_near(solution.x)
         return Minimum(
             start,
             self._values(solution.x),
             mean_square,
-            runs,
-            bool(solution.status > 0),
+            len(self._runs) - runs_before,
+            converged,
+            converged and mean_square <= 1.0 + CHANCE * (2.0 / freedom) ** 0.5,
             str(solution.message),
         )
+
+    def _stop_near(self, z: Floats) -> None:
+        """End a search at its minimum: further runs would follow the jumps of the steps."""
+        if self._is_near(z):
+            raise StopIteration
+
+    def _is_near(self, z: Floats) -> bool:
+        """Return whether the minimum of the linear model is within `NEAR` standard deviations."""
+        run = self._run(self._values(z))
+        values = np.array(list(self._values(z).values()))
+        down = run.jacobian.T @ run.residual
+        # A bound holds a value that the residual pulls over it.
+        width = AT_BOUND * np.maximum(np.abs(self._low), np.abs(self._high))
+        is_low = (values <= self._low + AT_BOUND * np.abs(self._low)) & (down > 0.0)
+        is_high = (values >= self._high - width) & (down < 0.0)
+        is_free = ~(is_low | is_high)
+        J = run.jacobian[:, is_free]
+        squared = down[is_free] @ np.linalg.pinv(J.T @ J) @ down[is_free]
+        # Noise that is larger than its given size makes the minimum as much less known.
+        excess = max(float(np.mean(run.residual**2)), 1.0)
+        return bool(squared <= NEAR**2 * excess)
 
     def _residual(self, z: Floats) -> Floats:
         return self._run(self._values(z)).residual
@@ -306,10 +400,21 @@ class _Search:
         rate = np.where(self._is_log, list(values.values()), 1.0)
         return self._run(values).jacobian * rate
 
-    def covariance(self, values: Mapping[str, float]) -> Floats:
-        """Return the covariance of values (P, P) by the noise of the observations."""
-        J = self._run(values).jacobian
-        return np.asarray(np.linalg.pinv(J.T @ J))
+    def covariance(self, minimum: Minimum) -> Floats:
+        """Return the covariance of the values (P, P) by the noise, and by what it leaves."""
+        J = self._run(minimum.values).jacobian
+        return np.asarray(max(minimum.mean_square, 1.0) * np.linalg.pinv(J.T @ J))
+
+    def shift_by_steps(self, minimum: Minimum) -> Floats:
+        """Return how far the minimum (P,) may be off by the steps of its run, or NaN."""
+        scene = self._scenes.scene(**minimum.values)
+        finer = replace(scene, preset=_finer(scene.preset)).run()
+        if not finer.valid:
+            return np.full(len(self._names), np.nan)
+        now = self._run(minimum.values)
+        change = self._compared(finer, []).residual - now.residual
+        J = now.jacobian
+        return np.asarray(-STEPS_SHARE * np.linalg.pinv(J.T @ J) @ (J.T @ change))
 
     def _run(self, values: Mapping[str, float]) -> _Run:
         key = tuple(values.values())
@@ -325,16 +430,27 @@ class _Search:
             return _Run(none[:, 0], none, run.reason)
         if not np.isfinite(derivatives).all():
             return _Run(none[:, 0], none, "the derivatives could not be solved")
+        return _Run(*self._compared(run, derivatives), "")
+
+    def _compared(self, run: ClothRun, derivatives: Sequence[Floats]) -> Compared:
         for observation in self._observations:
             observation.check(run)
-        residual = [observation.residual(run) for observation in self._observations]
-        by = [
-            np.concatenate(
-                [observation.jacobian(run, derivative) for observation in self._observations]
-            )
-            for derivative in derivatives
-        ]
-        return _Run(np.concatenate(residual), np.stack(by, axis=1), "")
+        parts = [observation.compare(run, derivatives) for observation in self._observations]
+        return Compared(
+            np.concatenate([part.residual for part in parts]),
+            np.concatenate([part.jacobian for part in parts]),
+        )
+
+
+def _finer(settings: SolverSettings) -> SolverSettings:
+    """Return settings whose steps are half as long."""
+    error = settings.step_error
+    return replace(
+        settings,
+        time_step=settings.time_step / FINER**0.5,
+        longest_step=settings.longest_step / FINER**0.5,
+        step_error=None if error is None else error / FINER,
+    )
 
 
 def check_observed(name: str, values: Floats, shape: Sequence[int | None]) -> None:

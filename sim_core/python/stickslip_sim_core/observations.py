@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stickslip_sim_core.arrays import Floats, check_positive
-from stickslip_sim_core.fit import check_observed
+from stickslip_sim_core.fit import Compared, check_observed
 from stickslip_sim_core.scenes.scene import ClothRun
 
 OUTLINE_STEP = 1e-3
@@ -32,6 +32,14 @@ def check_frames(frames: Sequence[int], vertices: NDArray[np.intp], run: ClothRu
 def points_at(frames: Sequence[int], vertices: NDArray[np.intp], points: Floats) -> Floats:
     """Return what a run has (frame, vertex, xyz) at some frames and vertices: (T, K, 3)."""
     return np.asarray(points[list(frames)][:, vertices])
+
+
+def compared(difference: Floats, changes: Sequence[Floats], noise: float) -> Compared:
+    """Return differences and their derivatives by each parameter over the noise, flat."""
+    by = np.empty((difference.size, len(changes)))
+    for number, change in enumerate(changes):
+        by[:, number] = change.ravel() / noise
+    return Compared(np.asarray(difference.ravel() / noise), by)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,12 +74,12 @@ class Vertices:
     def check(self, run: ClothRun) -> None:
         check_frames(self.frames, self.vertices, run)
 
-    def residual(self, run: ClothRun) -> Floats:
-        difference = points_at(self.frames, self.vertices, run.positions) - self.positions
-        return np.asarray(difference.ravel() / self.noise)
+    def compare(self, run: ClothRun, derivatives: Sequence[Floats]) -> Compared:
+        difference = self._points(run.positions) - self.positions
+        return compared(difference, [self._points(by) for by in derivatives], self.noise)
 
-    def jacobian(self, run: ClothRun, derivative: Floats) -> Floats:
-        return np.asarray(points_at(self.frames, self.vertices, derivative).ravel() / self.noise)
+    def _points(self, points: Floats) -> Floats:
+        return points_at(self.frames, self.vertices, points)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,13 +138,10 @@ class MarkedPixels:
     def check(self, run: ClothRun) -> None:
         check_frames(self.frames, self.vertices, run)
 
-    def residual(self, run: ClothRun) -> Floats:
-        projected = self.view.project(self._points(run.positions))
-        return np.asarray((projected - self.pixels).ravel() / self.noise)
-
-    def jacobian(self, run: ClothRun, derivative: Floats) -> Floats:
-        changes = self.view.project_change(self._points(run.positions), self._points(derivative))
-        return np.asarray(changes.ravel() / self.noise)
+    def compare(self, run: ClothRun, derivatives: Sequence[Floats]) -> Compared:
+        points = self._points(run.positions)
+        changes = [self.view.project_change(points, self._points(by)) for by in derivatives]
+        return compared(self.view.project(points) - self.pixels, changes, self.noise)
 
     def _points(self, points: Floats) -> Floats:
         return points_at(self.frames, self.vertices, points)
@@ -179,23 +184,26 @@ class Silhouettes:
     def check(self, run: ClothRun) -> None:
         check_frames(self.frames, np.empty(0, np.intp), run)
 
-    def residual(self, run: ClothRun) -> Floats:
-        parts = []
+    def compare(self, run: ClothRun, derivatives: Sequence[Floats]) -> Compared:
+        distances: list[Floats] = []
+        changes: list[list[Floats]] = [[] for _ in derivatives]
         for frame, points in zip(self.frames, self.outlines, strict=True):
+            # The search for the outline costs most, and all derivatives share it.
             nearest = self._nearest(run, frame, np.asarray(points, float))
-            parts.append(nearest.distances / self.noise)
-        return np.concatenate(parts)
+            distances.append(nearest.distances)
+            for of_parameter, derivative in zip(changes, derivatives, strict=True):
+                of_parameter.append(self._change(run, frame, nearest, derivative))
+        return compared(
+            np.concatenate(distances), [np.concatenate(parts) for parts in changes], self.noise
+        )
 
-    def jacobian(self, run: ClothRun, derivative: Floats) -> Floats:
-        parts = []
-        for frame, points in zip(self.frames, self.outlines, strict=True):
-            nearest = self._nearest(run, frame, np.asarray(points, float))
-            ends = nearest.edges
-            moved = self.view.project_change(run.positions[frame][ends], derivative[frame][ends])
-            change = (nearest.shares[..., None] * moved).sum(axis=1)
-            # The distance from the observed point falls as the outline moves towards it.
-            parts.append(-(change * nearest.normals).sum(axis=1) / self.noise)
-        return np.concatenate(parts)
+    def _change(self, run: ClothRun, frame: int, nearest: "_Nearest", derivative: Floats) -> Floats:
+        """Return the derivatives of the distances of a frame: (N,)."""
+        ends = nearest.edges
+        moved = self.view.project_change(run.positions[frame][ends], derivative[frame][ends])
+        change = (nearest.shares[..., None] * moved).sum(axis=1)
+        # The distance from the observed point falls as the outline moves towards it.
+        return np.asarray(-(change * nearest.normals).sum(axis=1))
 
     def _nearest(self, run: ClothRun, frame: int, points: Floats) -> "_Nearest":
         pixels = self.view.project(run.positions[frame])

@@ -88,8 +88,14 @@ def _as_json(scene: Scene, answer: Fit) -> dict[str, Any]:
     return {
         "values": dict(answer.values),
         "deviations": dict(answer.deviations),
+        "by_noise": dict(answer.by_noise),
+        # JSON has no NaN.
+        "by_steps": {
+            name: shift if np.isfinite(shift) else None for name, shift in answer.by_steps.items()
+        },
         "units": {name: scene.parameters[name].unit for name in answer.values},
         "mean_square": answer.mean_square,
+        "is_explained": answer.is_explained,
         "minima": answer.minima,
         "runs": answer.runs,
         "warning": answer.warning,

@@ -68,7 +68,7 @@ def fit(
             rows.append((name, f"{value:.5g}", f"{deviation:.2g}", answer["units"][name]))
         print_table(("parameter", "value", "standard deviation", "unit"), rows)
         say(answer["warning"] or f"noise explains the observations; {answer['runs']} runs")
-    raise click.exceptions.Exit(0 if answer["mean_square"] <= making.EXPLAINED else 1)
+    raise click.exceptions.Exit(0 if answer["is_explained"] else 1)
 
 
 def _values_of(start: str) -> dict[str, float]:

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
 DOCUMENT_NAME = "certificate.json"
 RESULT_NAME = "scene.json"
-EXPLAINED = 1.5
-"""Mean squared residual over the noise, up to which the noise explains observations."""
 TRAJECTORY_NAME = "trajectory.npz"
 
 
