@@ -96,7 +96,8 @@ class Body:
     def __post_init__(self) -> None:
         check_friction(self.mu)
         check_static_friction(self.mu, self.mu_static)
-        origin, turn = np.asarray(self.origin, float), np.asarray(self.rotation, float)
+        origin = np.asarray(self.origin, float)
+        turn = np.asarray(self.rotation, float)
         # A pose comes from a user's motion, so NaN and mirrored axes must stop here.
         if origin.shape != (3,) or not np.isfinite(origin).all():
             raise ValueError(f"origin: must be three finite numbers [m], got {origin.tolist()}")
@@ -148,7 +149,8 @@ def check_static_friction(mu: ArrayLike, mu_static: ArrayLike | None) -> None:
     """
     if mu_static is None:
         return
-    sliding, resting = np.asarray(mu, float), np.asarray(mu_static, float)
+    sliding = np.asarray(mu, float)
+    resting = np.asarray(mu_static, float)
     if sliding.shape != resting.shape:
         raise ValueError(
             f"mu_static: must have the shape of mu, {sliding.shape}, got {resting.shape}"
@@ -347,7 +349,8 @@ class SelfContact:
             ValueError: `mu` or `thickness` has another number of sheets.
         """
         # Only the mesh gives the number of sheets, so `__post_init__` could not check it.
-        mu, thickness = np.asarray(self.mu, float), np.asarray(self.thickness, float)
+        mu = np.asarray(self.mu, float)
+        thickness = np.asarray(self.thickness, float)
         if mu.ndim and mu.shape != (sheets, sheets):
             raise ValueError(f"mu: must be of {sheets} sheets, got {mu.tolist()}")
         if thickness.ndim and thickness.shape != (sheets,):

@@ -71,7 +71,8 @@ class Fabric:
         check_range("damping", self.damping, 0.0, DAMPING_MAX)
         if self.softening is not None:
             check_range("softening", self.softening, *SOFTENING_BOUNDS)
-        k, d = np.asarray(self.stretching, float), np.asarray(self.rigidity, float)
+        k = np.asarray(self.stretching, float)
+        d = np.asarray(self.rigidity, float)
         if k.shape != (6, 4) or not ((k >= 0.0) & (k <= STRETCHING_MAX)).all():
             raise ValueError(
                 f"stretching: must be (6, 4) numbers of 0 ... {STRETCHING_MAX:g} N/m, "
@@ -176,7 +177,8 @@ def custom_fabric(
             poisson,
             name=name,
         )
-        table, rigidity = plate.stretching, plate.rigidity
+        table = plate.stretching
+        rigidity = plate.rigidity
     else:
         # A table says nothing about the thickness, so bending cannot follow from it.
         measured = fabric(stretching).stretching if isinstance(stretching, str) else stretching

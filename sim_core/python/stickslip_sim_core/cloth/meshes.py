@@ -25,7 +25,8 @@ class Mesh:
     def spacing(self) -> float:
         """Square root of twice the mean area of a triangle [m]: the side of a cell of a grid."""
         a, b, c = (self.rest[self.triangles[:, i]] for i in range(3))
-        u, v = b - a, c - a
+        u = b - a
+        v = c - a
         return float(np.sqrt(np.mean(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])))
 
     @property
@@ -67,7 +68,9 @@ def grid(
     )
     # Corners of each cell, counter-clockwise from the lower left.
     a = row * (columns + 1) + column
-    b, c, d = a + 1, a + columns + 2, a + columns + 1
+    b = a + 1
+    c = a + columns + 2
+    d = a + columns + 1
     match diagonals:
         case "alternating":
             rising = (row + column) % 2 == 0
@@ -95,10 +98,14 @@ def together(*parts: Mesh) -> Mesh:
     """
     if len(parts) == 1:
         return parts[0]
-    rest, triangles, right, count = [], [], 0.0, 0
+    rest = []
+    triangles = []
+    right = 0.0
+    count = 0
     # A gap of a tenth of each sheet's width keeps the sheets apart at rest.
     for part in parts:
-        low, high = part.rest[:, 0].min(), part.rest[:, 0].max()
+        low = part.rest[:, 0].min()
+        high = part.rest[:, 0].max()
         rest.append(part.rest + np.array([right - low, 0.0]))
         triangles.append(part.triangles + count)
         right += 1.1 * (high - low)
@@ -153,10 +160,8 @@ def unstructured(
     starts = np.concatenate([[0], np.cumsum([len(strip) for strip in strips])])
     triangles: list[tuple[int, int, int]] = []
     for row in range(rows):
-        low, high = (
-            list(range(starts[row], starts[row + 1])),
-            list(range(starts[row + 1], starts[row + 2])),
-        )
+        low = list(range(starts[row], starts[row + 1]))
+        high = list(range(starts[row + 1], starts[row + 2]))
         i = j = 0
         while i < len(low) - 1 or j < len(high) - 1:
             # Advance on the row whose next edge has its middle further to the left.
@@ -272,11 +277,13 @@ def _delaunay(
             sides[edge] = t
 
     def cotangent(corner: int, i: int, j: int) -> float:
-        u, v = rest[i] - rest[corner], rest[j] - rest[corner]
+        u = rest[i] - rest[corner]
+        v = rest[j] - rest[corner]
         return float(u @ v / abs(u[0] * v[1] - u[1] * v[0]))
 
     def area(a: int, b: int, c: int) -> float:
-        u, v = rest[b] - rest[a], rest[c] - rest[a]
+        u = rest[b] - rest[a]
+        v = rest[c] - rest[a]
         return float(u[0] * v[1] - u[1] * v[0])
 
     todo = list(sides)
@@ -285,7 +292,8 @@ def _delaunay(
         # An earlier flip removed the edge, or it is on the boundary.
         if (a, b) not in sides or (b, a) not in sides:
             continue
-        left, right = sides[a, b], sides[b, a]
+        left = sides[a, b]
+        right = sides[b, a]
         c = next(v for v in cells[left] if v not in (a, b))
         d = next(v for v in cells[right] if v not in (a, b))
         # Angles add up to more than pi if the sum of their cotangents is negative. The slack keeps

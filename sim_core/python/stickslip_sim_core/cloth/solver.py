@@ -331,7 +331,8 @@ class Cloth:
             ValueError: A vertex does not exist, or comes twice; or no vertex is free.
         """
         # The set of held vertices decides the unknowns of the C++ solver, so it needs a new one.
-        positions, velocities = self.positions, self.velocities
+        positions = self.positions
+        velocities = self.velocities
         sensitivities = self.sensitivities, self.velocity_sensitivities
         self.held = np.asarray(vertices, dtype=np.int32).reshape(-1)
         self._solver = self._make(held=self.held.tolist())
@@ -415,10 +416,8 @@ class Cloth:
             time: float,
         ) -> tuple[Floats, Floats, Floats, list[BodyTuple], float, list[RatesTuple]]:
             self.gravity, held, bodies = motion(time)
-            ends, tuples = (
-                np.asarray(held, float).reshape(-1, 3),
-                [body.as_tuple() for body in bodies],
-            )
+            ends = np.asarray(held, float).reshape(-1, 3)
+            tuples = [body.as_tuple() for body in bodies]
             surfaces = self._surfaces_at(time)
             return (
                 self.gravity,
@@ -499,7 +498,8 @@ class Cloth:
                 f"time: must be in the last step, {begin:g} ... {self.time:g} s, got {time:g}"
             )
         # Hermite's cubic: the straight part with zero velocities, and a bent part for velocities.
-        h, s = self.time - begin, (time - begin) / (self.time - begin)
+        h = self.time - begin
+        s = (time - begin) / (self.time - begin)
         (x, v), (x_end, v_end) = before, now
         way = x_end - x
         if straight:

@@ -96,7 +96,8 @@ def _slope_of_end(fabric: Fabric, direction: Direction, overhang: float) -> floa
     sides = (CELLS * cell, across * cell)
     cells = (CELLS, across)
     if direction == "weft":
-        sides, cells = sides[::-1], cells[::-1]
+        sides = sides[::-1]
+        cells = cells[::-1]
     mesh = meshes.grid(*sides, *cells)
     axis = ("warp", "weft").index(direction)
     along = mesh.rest[:, axis] - mesh.rest[:, axis].min() - 0.5 * cell

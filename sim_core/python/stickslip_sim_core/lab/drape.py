@@ -124,7 +124,8 @@ def shadow_beyond_pedestal(positions: Floats, triangles: NDArray[np.int32]) -> f
         # The pixels of the box around the triangle.
         low = np.floor((corners.min(axis=0) + half) / SHADOW_PIXEL).astype(int)
         high = np.ceil((corners.max(axis=0) + half) / SHADOW_PIXEL).astype(int) + 1
-        columns, rows = slice(low[0], high[0]), slice(low[1], high[1])
+        columns = slice(low[0], high[0])
+        rows = slice(low[1], high[1])
         covered[columns, rows] |= _inside(corners, centres[columns], centres[rows])
     beyond = np.hypot(centres[:, None], centres[None, :]) > PEDESTAL_RADIUS
     return float((covered & beyond).sum()) * SHADOW_PIXEL**2
@@ -138,7 +139,8 @@ def _inside(corners: Floats, x: Floats, y: Floats) -> NDArray[np.bool_]:
     # A triangle that is seen edge on has no shadow.
     if abs(area) < 1e-14:
         return np.zeros((len(x), len(y)), dtype=bool)
-    dx, dy = x[:, None] - a[0], y[None, :] - a[1]
+    dx = x[:, None] - a[0]
+    dy = y[None, :] - a[1]
     # Barycentric coordinates.
     s = (dx * vy - dy * vx) / area
     t = (dy * ux - dx * uy) / area

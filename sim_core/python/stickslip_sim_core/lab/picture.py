@@ -9,7 +9,8 @@ SIZE = 480
 """Side of the picture [px]."""
 LIGHT = np.array([-0.5, 0.5, 0.7])
 """Direction to the lamp; from above left."""
-DARKEST, BRIGHTEST = 60.0, 235.0
+DARKEST = 60.0
+BRIGHTEST = 235.0
 """Grey of cloth that faces away from the lamp, and towards it."""
 
 

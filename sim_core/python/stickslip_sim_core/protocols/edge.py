@@ -19,7 +19,8 @@ from stickslip_sim_core.protocols.protocol import ClothProtocol
 
 RADII = (1.0, 2.0, 3.0)
 FRICTION = (0.3, 0.6)
-BOX, SKIN = 0, 1
+BOX = 0
+SKIN = 1
 """Edges: that of a rounded box, and that of a sharp mesh with a skin."""
 
 CELL = 0.005  # m
@@ -40,7 +41,8 @@ FABRIC = custom_fabric(
 LINE_WEIGHT = DENSITY * GRAVITY * WIDTH  # N/m
 SPEED = 0.02  # of the end that is pulled [m/s]
 # The end is pulled from the first time to the last [s].
-START, END = 1.0, 3.0
+START = 1.0
+END = 3.0
 # The pull goes up and down as cells pass: the mean is that over two cells of way, at this interval.
 INTERVAL = 0.02  # s
 STEPS = 2000
@@ -76,7 +78,8 @@ class Edge(ClothProtocol):
     tolerance: float = 0.03
 
     def measure(self, x: float, at: Mapping[str, Any]) -> tuple[float, float]:
-        radius, mu = x * CELL, at["mu"]
+        radius = x * CELL
+        mu = at["mu"]
         table = box_table(mu, radius) if at["edge"] == BOX else skin_table(mu, radius)
         pulled = pull_over(table, radius, mu, self.solver)
         self.tally.count(pulled.cloth)

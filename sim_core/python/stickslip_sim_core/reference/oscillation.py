@@ -63,7 +63,8 @@ def shaken_block(
     position = speed = 0.0
     for tick in range(round(until / step)):
         # The mean velocity of the floor over the step.
-        begin, end = omega * tick * step, omega * (tick + 1) * step
+        begin = omega * tick * step
+        end = omega * (tick + 1) * step
         floor = size * (math.cos(begin) - math.cos(end)) / step
         speed += min(max(floor - speed, -most), most)
         position += speed * step

@@ -10,7 +10,8 @@ from scipy.optimize import brentq
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.reference.boundary_values import NotSolvedError
 
-RELATIVE, ABSOLUTE = 1e-11, 1e-13
+RELATIVE = 1e-11
+ABSOLUTE = 1e-13
 """Tolerances of the integration, with which the drop has nine digits."""
 
 TIPS = 64

@@ -139,7 +139,9 @@ class _Search:
                 state = self.rod(tilt, state)
                 residual = np.inf if state is None else root_mean_square(state.residual(self.data))
                 if residual < least:
-                    best_tilt, best, least = tilt, state, residual
+                    best_tilt = tilt
+                    best = state
+                    least = residual
         if best is None:
             raise RuntimeError("no rod near the centreline hangs in a stable equilibrium")
         # The minimum is within a step of the best tilt.

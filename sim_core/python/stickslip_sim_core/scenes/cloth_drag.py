@@ -267,7 +267,8 @@ def family(
         settings: Other arguments of `scene`.
     """
     made = fabric(material) if isinstance(material, str) else material
-    mesh, preset = settings.pop("mesh", 41), settings.pop("preset", "certified")
+    mesh = settings.pop("mesh", 41)
+    preset = settings.pop("preset", "certified")
     drag = Drag(fabric=made, mu=mu, mesh=_square(mesh), preset=preset_named(preset), **settings)
 
     def make(values: Mapping[str, float], hanging: Hang) -> Scene:

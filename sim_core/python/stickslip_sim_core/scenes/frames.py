@@ -96,7 +96,8 @@ def _crosses_surfaces(cloth: Cloth, time: float, smooth: Floats, straight: Float
     # The search takes as long as a step, and slow cloth bends its path by far less.
     if not cloth.surfaces or not np.abs(smooth - straight).max() > DEPTH:
         return False
-    low, high = smooth.min(axis=0), smooth.max(axis=0)
+    low = smooth.min(axis=0)
+    high = smooth.max(axis=0)
     alone = self_intersections(smooth, cloth.mesh.triangles)
     for surface in cloth.surfaces:
         points = surface.at(time)
