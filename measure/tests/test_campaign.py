@@ -1,5 +1,6 @@
 """A campaign goes on after a fault, and where it was interrupted."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -113,13 +114,16 @@ def test_the_page_says_who_holds_and_why_a_cell_has_no_value(
     page = write_page(tmp_path).read_text()
     assert "<h1>Who holds, and who creeps</h1>" in page
     # The verdict, the cell of creep, and the reason of both; text of an adapter is no markup.
-    assert '<td class="none" title="ValueError: &lt;lost&gt;">no answer</td>' in page
+    entry = 'class="none" data-column="verdict" title="ValueError: &lt;lost&gt;">no answer</td>'
+    assert entry in page
     assert "failed: ValueError: &lt;lost&gt;" in page
     assert "<lost>" not in page
     assert "not supported: needs curved, planes" in page
     # The fall has a curve, and says what the adapter did.
     assert 'aria-label="A patch falls: height [mm] against time [s]"' in page
     assert "step: 10 ms" in page
+    # And when, where and with which limit it was measured.
+    assert re.search(r"Measured on 20\d\d-\d\d-\d\d on .* with at most 600 s of CPU time", page)
 
 
 def test_the_command_writes_a_page_or_says_that_nothing_was_measured(

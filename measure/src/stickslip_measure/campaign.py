@@ -7,9 +7,12 @@ it stopped. A cell is measured again if the adapter or the experiments have chan
 import hashlib
 import json
 import math
+import os
+import platform
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 from stickslip_measure import experiments
@@ -28,8 +31,11 @@ CALIBRATED = "bending calibrated"
 FACTOR = 0.01
 """A bending stiffness within this share needs no calibration."""
 
-POINTS = 200
-"""Most points of a picture that a cell keeps."""
+POINTS = 100
+"""Points of a picture that a cell keeps: at most twice as many."""
+
+DIGITS = 5
+"""Significant digits of these points, which no eye can tell from all of them."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +58,9 @@ class Cell:
 
     key: str
     """Digest of adapter, interpreter and experiments."""
+
+    conditions: dict[str, str | float] = field(default_factory=dict)
+    """When and where it was measured: `conditions_of`."""
 
     details: dict[str, float] = field(default_factory=dict)
     x: list[float] = field(default_factory=list)
@@ -164,6 +173,7 @@ def _experiment(
         )
         cell = _cell(laboratory, experiment, cells, row, key, slow)
         slow = slow or cell.state == SlowError.state
+        cell = replace(cell, conditions=conditions_of(request))
         _write(path, cell)
         yield cell
 
@@ -195,7 +205,7 @@ def _cell(
         # A picture needs fewer points than a simulation has steps.
         every = max(1, len(reading.x) // POINTS)
         curves = [
-            [float(number) for number in curve[::every]]
+            [float(f"{number:.{DIGITS}g}") for number in curve[::every]]
             for curve in (reading.x, reading.measured, reading.reference)
         ]
         return Cell(
@@ -206,9 +216,21 @@ def _cell(
             reading.expected,
             laboratory.cpu,
             key,
-            dict(reading.details),
-            *curves,
+            details=dict(reading.details),
+            x=curves[0],
+            measured=curves[1],
+            reference=curves[2],
         )
+
+
+def conditions_of(request: Request) -> dict[str, str | float]:
+    """Return when and where a cell is measured, and its limit of CPU time [s]."""
+    return {
+        "date": datetime.now(UTC).date().isoformat(),
+        "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
+        "load": round(os.getloadavg()[0], 1),
+        "budget": request.budget,
+    }
 
 
 def _path(

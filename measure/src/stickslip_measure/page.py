@@ -36,14 +36,17 @@ def write_page(out: Path) -> Path:
     Raises:
         ValueError: A file of the folder is no cell.
     """
-    rows = rows_of(read_cells(out))
-    simulators = read_simulators(out)
+    cells = read_cells(out)
+    rows = rows_of(cells)
     text = TEMPLATE.substitute(
         version=escape(__version__),
         overview=overview(rows),
         findings="".join(finding_items(rows)),
         experiments="".join(section(experiment, rows) for experiment in chosen(rows)),
-        simulators="".join(simulator_text(facts) for facts in simulators),
+        simulators="".join(
+            simulator_text(facts, [cell for cell in cells if cell.simulator == facts["name"]])
+            for facts in read_simulators(out)
+        ),
     )
     page = out / "index.html"
     page.write_text(text, encoding="utf-8")
@@ -86,37 +89,43 @@ def overview(rows: Mapping[Row, Sequence[Cell]]) -> str:
         f'<th><a href="#{name}">{escape(name.replace("-", " "))}</a></th>'
         for name in experiments.EXPERIMENTS
     )
-    lines = [f"<tr><th>simulator</th><th>row</th><th>verdict</th>{heads}</tr>"]
+    lines = [f'<tr><th class="who">simulator</th><th>verdict</th>{heads}</tr>']
     for (simulator, row), cells in rows.items():
         entries = "".join(entry(cells, each) for each in experiments.EXPERIMENTS.values())
-        lines.append(
-            f"<tr><th>{escape(simulator)}</th><td>{escape(row)}</td>{verdict(cells)}{entries}</tr>"
-        )
+        simulator_head = f'<th class="who">{escape(simulator)}<small>{escape(row)}</small></th>'
+        lines.append(f"<tr>{simulator_head}{verdict(cells)}{entries}</tr>")
     return "\n".join(lines)
+
+
+def table_entry(name: str, mark: str, content: str, reason: str = "") -> str:
+    """Return an entry of the first table; a narrow screen shows the name of its column, too."""
+    title = f' title="{escape(reason)}"' if reason else ""
+    label = escape(name.replace("-", " "))
+    return f'<td class="{mark}" data-column="{label}"{title}>{content}</td>'
 
 
 def verdict(cells: Sequence[Cell]) -> str:
     """Return whether cloth holds at 90 % of the angle of slip, as an entry of the table."""
     cell = at_default(cells, experiments.EXPERIMENTS["creep"])
     if cell is None:
-        return '<td class="none">not asked</td>'
+        return table_entry("verdict", "none", "not asked")
     if cell.value is None:
         # Only a simulator that sleeps has been found out: others gave no answer, and did not fail.
         mark, word = ("poor", "sleeps") if cell.state == "sleeps" else ("none", "no answer")
-        return f'<td class="{mark}" title="{escape(cell.reason)}">{word}</td>'
+        return table_entry("verdict", mark, word, cell.reason)
     if cell.value < CREEP:
-        return '<td class="good">holds</td>'
-    return '<td class="poor">creeps</td>'
+        return table_entry("verdict", "good", "holds")
+    return table_entry("verdict", "poor", "creeps")
 
 
 def entry(cells: Sequence[Cell], experiment: Experiment) -> str:
     """Return the error at the default resolution, or the reason why there is none."""
     cell = at_default(cells, experiment)
     if cell is None:
-        return '<td class="none">–</td>'
+        return table_entry(experiment.name, "absent", "–")
     if cell.state != MEASURED:
-        return f'<td class="none" title="{escape(cell.reason)}">{escape(cell.state)}</td>'
-    return f'<td class="{grade(cell, experiment)}">{error_text(cell, experiment)}</td>'
+        return table_entry(experiment.name, "none", escape(cell.state), cell.reason)
+    return table_entry(experiment.name, grade(cell, experiment), error_text(cell, experiment))
 
 
 def grade(cell: Cell, experiment: Experiment) -> str:
@@ -137,7 +146,8 @@ def error_text(cell: Cell, experiment: Experiment) -> str:
         return "–"
     if experiment.unit:
         return f"{error:.2g} {escape(experiment.unit)}"
-    return f"{100.0 * error:+.2f} %"
+    # No decimals where the first figure is wrong already.
+    return f"{100.0 * error:+.2f} %" if abs(error) < 0.1 else f"{100.0 * error:+.0f} %"
 
 
 def finding_items(rows: Mapping[Row, Sequence[Cell]]) -> Iterator[str]:
@@ -240,8 +250,8 @@ def picture(experiment: Experiment, rows: Mapping[Row, Sequence[Cell]]) -> str:
     return svg.replace("<svg", f'<svg role="img" aria-label="{label}"', 1)
 
 
-def simulator_text(facts: Mapping[str, Any]) -> str:
-    """Return the versions of a simulator, and what its adapter did."""
+def simulator_text(facts: Mapping[str, Any], cells: Sequence[Cell]) -> str:
+    """Return the versions of a simulator, what its adapter did, and how it was measured."""
     items = []
     for setting, numbers in facts["settings"].items():
         pairs = ", ".join(f"{name}: {value}" for name, value in numbers.items())
@@ -250,7 +260,23 @@ def simulator_text(facts: Mapping[str, Any]) -> str:
         f"<h3>{escape(facts['name'])} {escape(facts['version'])}</h3>"
         f"<p>Python {escape(facts['python'])}, NumPy {escape(facts['numpy'])}. Can: "
         f"{escape(', '.join(facts['capabilities']))}. Clearance {facts['clearance']:g} m, gap "
-        f"{facts['gap']:g} m.</p><ul>{''.join(items)}</ul>"
+        f"{facts['gap']:g} m. {escape(conditions_text(cells))}</p><ul>{''.join(items)}</ul>"
+    )
+
+
+def conditions_text(cells: Sequence[Cell]) -> str:
+    """Return when and where the cells of a simulator were measured, and with which limit."""
+    conditions = [cell.conditions for cell in cells]
+    if not all(conditions):
+        return ""
+    dates = sorted({str(each["date"]) for each in conditions})
+    machines = sorted({str(each["machine"]) for each in conditions})
+    loads = [float(each["load"]) for each in conditions]
+    budgets = sorted({float(each["budget"]) for each in conditions})
+    limits = " or ".join(f"{budget:g}" for budget in budgets)
+    return (
+        f"Measured on {' and '.join(dates)} on {' and '.join(machines)}, at a load of "
+        f"{min(loads):g} to {max(loads):g}, with at most {limits} s of CPU time for a cell."
     )
 
 
@@ -280,20 +306,35 @@ body { font: 15px/1.45 system-ui, sans-serif; margin: 1rem auto; max-width: 1240
 h1 { font-size: 1.4rem; margin: 0 0 .3rem; }
 table { border-collapse: collapse; font-size: 13px; }
 th, td { border: 1px solid #c9ced3; padding: .25rem .4rem; text-align: left; }
-.overview th, .overview td { text-align: center; }
-.overview .good, .overview .fair, .overview .poor { white-space: nowrap; }
+.overview { width: 100%; table-layout: fixed; font-size: 12px; line-height: 1.25; }
+.overview th, .overview td { text-align: center; padding: .2rem .15rem; }
+.overview .who { width: 8.5em; text-align: left; overflow-wrap: anywhere; }
+.overview small { display: block; font-weight: normal; }
 .wide { overflow-x: auto; }
 .good { background: #d5efd8; color: #0d3b16; }
 .fair { background: #fbeec2; color: #4d3b00; }
 .poor { background: #f8d3cf; color: #5c1008; }
-.none { color: #59636e; }
+.none, .absent { color: #59636e; }
 .reason { max-width: 22rem; }
 section { border-top: 1px solid #c9ced3; margin-top: 1.2rem; }
 svg { background: #fff; max-width: 100%; height: auto; }
 a { color: inherit; }
+/* On a narrow screen each simulator is a card, and each entry has the name of its column. */
+@media (max-width: 900px) {
+  .overview, .overview tbody, .overview tr { display: block; font-size: 13px; }
+  .overview tr:first-child { display: none; }
+  .overview tr { columns: 2 9.5rem; column-gap: .5rem; margin-bottom: .8rem; }
+  .overview .who { display: block; width: auto; column-span: all; border: 0; }
+  .overview small { display: inline; margin-left: .5em; }
+  .overview td { display: flex; justify-content: space-between; gap: .5rem; text-align: right;
+    break-inside: avoid; padding: .2rem .4rem; }
+  .overview .absent { display: none; }
+  .overview .good, .overview .fair, .overview .poor { white-space: nowrap; }
+  .overview td::before { white-space: normal; content: attr(data-column); text-align: left; }
+}
 @media (prefers-color-scheme: dark) {
   body { background: #14181c; color: #e4e8eb; }
-  .none { color: #a7b0b8; }
+  .none, .absent { color: #a7b0b8; }
   th, td, section { border-color: #454d55; }
 }
 </style>
@@ -303,9 +344,9 @@ a { color: inherit; }
 <p>Errors at the default resolution against closed forms: within 1 % green, within 5 % yellow.
 "Holds" is less than 0.1 mm in 10 s at 90 % of the angle of slip, awake. Made by
 stickslip-measure $version.</p>
-<div class="wide"><table class="overview">
+<table class="overview">
 $overview
-</table></div>
+</table>
 <ul>$findings</ul>
 <h2>Rules</h2>
 <ul>

@@ -313,7 +313,8 @@ class Simulation:
         self.positions = frames[-1]
         if self._process.cpu > self._process.budget:
             raise SlowError(
-                f"the CPU time of the cell was over after {self.time:.3g} s of the scene "
+                f"the {self._process.budget:.0f} CPU s that the cell had left were over after "
+                f"{self.time:.3g} s of the scene "
                 f"({done + len(batch)} of {total} steps of this part)"
             )
         return np.asarray(frames)

@@ -9,6 +9,7 @@ import pybullet
 
 MARGIN = 1e-3  # m
 DAMPING = 0.1  # of springs, as in Bullet's examples: without it they diverge
+SPRINGS = f"Y along edges, D / cell^2 across them, damping {DAMPING}; margin 1 mm"
 STEPS = {"default": 1.0 / 240.0, "tuned": 1.0 / 960.0}
 ITERATIONS = {"default": 50, "tuned": 200}
 THICK = 1.0  # of a box that stands for a plane [m]
@@ -23,11 +24,11 @@ class Simulator:
     capabilities = frozenset({"held", "floor", "planes", "cylinders"})
     clearance = MARGIN
     settings: ClassVar = {
-        "default": {"step": "1/240 s", "iterations": 50, "damping of springs": DAMPING},
+        "default": {"step": "1/240 s", "iterations": 50, "springs": SPRINGS},
         "tuned": {
             "step": "1/960 s",
             "iterations": 200,
-            "damping of springs": DAMPING,
+            "springs": SPRINGS,
             "source": "PyBullet Quickstart Guide (bullet3), setPhysicsEngineParameter",
         },
     }
@@ -88,9 +89,8 @@ def add_body(body: Any) -> None:
         shape = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=sides)
         place = place - 0.5 * THICK * axis
     else:
-        shape = pybullet.createCollisionShape(
-            pybullet.GEOM_CYLINDER, radius=body.radius, height=1.0
-        )
+        kind = pybullet.GEOM_CYLINDER
+        shape = pybullet.createCollisionShape(kind, radius=body.radius, height=1.0)
     # The quaternion that turns z to the axis, by the half angle.
     turn = np.append(np.cross([0.0, 0.0, 1.0], axis), 1.0 + axis[2])
     number = pybullet.createMultiBody(0.0, shape, -1, place, turn / np.linalg.norm(turn))

@@ -34,7 +34,12 @@ class Simulator:
     version = version("pyelastica")
     capabilities = frozenset({"rods"})
     settings: ClassVar = {
-        "default": {"radius": "0.01 lengths", "clamp": "OneEndFixedBC", "step": "0.3 of stable"}
+        "default": {
+            "radius": "0.01 lengths, with the moduli that give EI and GJ",
+            "clamp": "OneEndFixedBC",
+            "step": "0.3 of the shortest period of an element",
+            "damping": "none, but while a scene settles",
+        }
     }
     frame = FRAME
     rate = 0.0

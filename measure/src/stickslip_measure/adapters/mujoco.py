@@ -23,10 +23,10 @@ class Simulator:
     clearance = RADIUS
     gap = 2.0 * RADIUS
     settings: ClassVar = {
-        "default": {"options": OPTIONS["default"], "masses": "equal, by flexcomp"},
+        "default": {"options": OPTIONS["default"], "flexcomp": "Y, D by young, thickness"},
         "tuned": {
             "options": f"{OPTIONS['tuned']} {CONTACTS['tuned']}",
-            "masses": "by area, written into body_mass",
+            "flexcomp": "Y, D by young, thickness; masses by area",
             "source": "https://mujoco.readthedocs.io/en/stable/modeling.html#contact-parameters",
         },
     }

@@ -12,6 +12,16 @@ SOURCE = "https://newton-physics.github.io/newton/latest/api/newton_solvers.html
 ITERATIONS = {"default": 10, "tuned": 100}
 EPSILON = {"default": 1e-2, "tuned": 1e-4}
 
+CHOICES = {
+    "step": "1/60 s",
+    "substeps": 2,
+    "damping": "0: Style3D has none of its own, and none is added",
+    "stretching": "tri_aniso_ke = Y, Y, Y/2 (warp, weft, shear)",
+    "bending": "edge_aniso_ke = D",
+    "particle radius": "1 mm",
+    "friction": "contacts take the root of the product, so bodies have mu^2 over that of cloth",
+}
+
 
 class Simulator(Sheets):
     """Sheets of cloth. Sheets push each other away, and have no friction with each other."""
@@ -20,8 +30,8 @@ class Simulator(Sheets):
     capabilities = frozenset({"held", "floor", "planes", "cylinders", "curved"})
     substeps = 2
     settings: ClassVar = {
-        "default": {"iterations": 10, "friction_epsilon": 1e-2, "substeps": 2},
-        "tuned": {"iterations": 100, "friction_epsilon": 1e-4, "substeps": 2, "source": SOURCE},
+        "default": {"iterations": 10, "friction_epsilon": 1e-2, **CHOICES},
+        "tuned": {"iterations": 100, "friction_epsilon": 1e-4, **CHOICES, "source": SOURCE},
     }
 
     def builder(self) -> Any:

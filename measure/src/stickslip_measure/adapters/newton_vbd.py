@@ -13,6 +13,16 @@ SOLVERS = {
     "tuned": {"iterations": 100, "friction_epsilon": 1e-4},
 }
 
+CHOICES = {
+    "step": "1/60 s",
+    "substeps": 10,
+    "damping of triangles and edges": "0, since a scene has none (Newton's defaults have some)",
+    "stretching": "tri_ke = Y/2, tri_ka = 0",
+    "bending": "edge_ke = D over the length of a cell",
+    "particle radius": "1 mm",
+    "friction": "contacts take the root of the product, so bodies have mu^2 over that of cloth",
+}
+
 
 class Simulator(Sheets):
     """Sheets of cloth."""
@@ -20,8 +30,8 @@ class Simulator(Sheets):
     name = "newton-vbd"
     substeps = 10
     settings: ClassVar = {
-        "default": {**SOLVERS["default"], "substeps": 10},
-        "tuned": {**SOLVERS["tuned"], "substeps": 10, "source": SOURCE},
+        "default": {**SOLVERS["default"], **CHOICES},
+        "tuned": {**SOLVERS["tuned"], **CHOICES, "source": SOURCE},
     }
 
     def add_sheets(self, builder: Any, scene: Any, **sheets: Any) -> None:
