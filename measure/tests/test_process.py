@@ -4,6 +4,7 @@ import ast
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,11 +26,11 @@ from stickslip_measure.process import (
     describe,
 )
 from stickslip_sim_core.cloth import meshes
-from stickslip_sim_core.cloth.contact import plane
+from stickslip_sim_core.cloth.contact import SelfContact, plane
 from stickslip_sim_core.cloth.fabrics import isotropic
 from stickslip_sim_core.cloth.presets import preset_named
 from stickslip_sim_core.cloth.solver import GRAVITY, Cloth
-from stickslip_sim_core.protocols.inclined_plane import OnSlope
+from stickslip_sim_core.protocols.inclined_plane import ROUGHER, OnSlope, Stack
 
 Adapter = Callable[..., Program]
 
@@ -146,27 +147,69 @@ def test_what_runs_beside_a_simulator_is_python_3_9(name: str) -> None:
     assert "annotations" in ast.unparse(tree.body[1])
 
 
-def test_the_core_by_its_adapter_gives_the_slope_of_the_protocol(tmp_path: Path) -> None:
-    """The slope and the drift of `OnSlope`, with the positions of a process: bit by bit."""
-    scene = patch()
-    certified = preset_named("certified")
-    direct = Cloth(
+class SlopeOfStack(OnSlope):
+    """The slopes through which the protocol `stacked-incline` goes."""
+
+    share_from = Stack.share_from
+    share_to = Stack.share_to
+    rate = Stack.rate
+    slid = Stack.slid
+
+
+def stack() -> Sheet:
+    """Return a sheet on a wider sheet, on a rougher floor."""
+    lower = meshes.grid(0.15, 0.15, 6, 6)
+    upper = meshes.grid(0.1, 0.1, 4, 4)
+    whole = meshes.together(lower, upper)
+    level = np.repeat(np.arange(2, dtype=np.int32), [len(lower.rest), len(upper.rest)])
+    points = np.concatenate([lower.rest, upper.rest])
+    return replace(
+        patch(),
+        rest=whole.rest,
+        start=np.column_stack([points, 5e-4 * level]),
+        triangles=whole.triangles,
+        sheet=level,
+        bodies=(Body("plane", ROUGHER * MU, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),),
+        friction=MU,
+        gap=5e-4,
+    )
+
+
+def laid(scene: Sheet) -> Cloth:
+    """Return the cloth of a scene, as protocols make it."""
+    # Protocols give each pair of sheets its friction, here also that of a sheet with itself.
+    friction = MU * np.array([[ROUGHER, 1.0], [1.0, ROUGHER]])
+    touch = None if scene.friction is None else SelfContact(friction, scene.gap)
+    return Cloth(
         meshes.Mesh(scene.rest, scene.triangles),
         isotropic(scene.density, scene.stretching, scene.bending),
-        certified,
+        preset_named("certified"),
+        self_contact=touch,
         force_scale=0.1 * scene.density * scene.cell**2 * GRAVITY,
     )
-    protocol = OnSlope(direct, scene.start, MU, MU, np.ones(len(scene.start), dtype=bool))
+
+
+@pytest.mark.physics
+@pytest.mark.parametrize("verb", ["slip_slope", "drift"])
+@pytest.mark.parametrize(
+    ("scene", "kind"), [(patch(), OnSlope), (stack(), SlopeOfStack)], ids=["patch", "stack"]
+)
+def test_the_core_by_its_adapter_gives_the_numbers_of_the_protocol(
+    scene: Sheet, kind: type[OnSlope], verb: str, tmp_path: Path
+) -> None:
+    """Slope of slip and creep, by the steps of `OnSlope`, with the positions of a process."""
+    direct = laid(scene)
+    floor = scene.bodies[0].friction
+    upper = scene.sheet == scene.sheet.max()
+    protocol = kind(direct, scene.start, MU, floor, upper)
     with AdapterProcess(STICKSLIP, tmp_path / "log", 60.0) as process:
-        remote = OnSlope(
-            RemoteCloth(Simulation(process, scene, "default"), certified),  # type: ignore[arg-type]
-            scene.start,
-            MU,
-            MU,
-            np.ones(len(scene.start), dtype=bool),
-        )
-        assert remote.slip_slope() == protocol.slip_slope()
-        np.testing.assert_array_equal(remote.cloth.positions, direct.positions)
+        remote_cloth = RemoteCloth(Simulation(process, scene, "default"), direct.preset)
+        remote = kind(remote_cloth, scene.start, MU, floor, upper)  # type: ignore[arg-type]
+        expected = getattr(protocol, verb)()
+        assert np.isfinite(expected)
+        # Bit by bit: neither the process nor the adapter changes a number.
+        assert getattr(remote, verb)() == expected
+        np.testing.assert_array_equal(remote_cloth.positions, direct.positions)
 
 
 class RemoteCloth:
@@ -185,6 +228,8 @@ class RemoteCloth:
         np.testing.assert_array_equal(self.positions, start)
 
     def step(self, dt: float, bodies: object) -> None:
-        assert repr(bodies) == repr([plane(MU)])
+        scene = self.simulation.scene
+        assert isinstance(scene, Sheet)
+        assert repr(bodies) == repr([plane(scene.bodies[0].friction)])
         assert dt == self.simulation.frame
         self.simulation.advance(self.gravity[:1])
