@@ -78,7 +78,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Request:
-    """What a user asks to be measured."""
+    """A request of a user: experiments and rows of one program, with limits."""
 
     program: Program
     out: Path
@@ -279,7 +279,7 @@ def read_cells(out: Path) -> list[Cell]:
 
 
 def convergence(cells: Sequence[Cell]) -> Convergence:
-    """Return what the resolutions of an experiment on one row show."""
+    """Return the findings of the resolutions of an experiment on one row."""
     ordered = sorted(cells, key=lambda cell: cell.cells)
     expected = next((cell.expected for cell in ordered if cell.expected is not None), math.nan)
     return converged([cell.cells for cell in ordered], [cell.value for cell in ordered], expected)

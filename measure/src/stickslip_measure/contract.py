@@ -1,4 +1,4 @@
-"""The contract: what a simulator receives, and the one class that an adapter offers.
+"""The contract: the input of a simulator, and the class that an adapter offers.
 
 SI units, float64, z is up. An adapter is a Python file with a class `Simulator`, which looks like
 `Adapter` below. It imports nothing of this package: it runs in the environment of its simulator,

@@ -16,7 +16,7 @@ ORDERS = (0.5, 6.0)
 
 @dataclass(frozen=True)
 class Convergence:
-    """What three resolutions show."""
+    """The finding of three resolutions."""
 
     limit: float
     """Value of small cells, NaN if the values do not converge."""

@@ -41,7 +41,7 @@ CREEP = 0.1
 
 @dataclass(frozen=True)
 class Finding:
-    """A fault, and what shows it."""
+    """A fault, and the evidence for it."""
 
     fault: str
     evidence: str

@@ -71,7 +71,7 @@ class Host:
         return bytes(self.wire.encoded(reply, results))
 
     def describe(self, header: dict[str, Any], arrays: list[Any]) -> tuple[Any, list[Any]]:
-        """Import the adapter, and return what it says about itself."""
+        """Import the adapter, and return its description of itself."""
         # An adapter may import files beside it. They come last: an adapter often has the name of
         # the simulator that it imports.
         sys.path.append(str(self.adapter.parent))

@@ -1,4 +1,4 @@
-"""What an experiment is, and what it gets: a laboratory that opens scenes on one simulator."""
+"""An experiment, and its laboratory, which opens scenes on one simulator."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -25,7 +25,7 @@ LOOK = 0.25
 
 
 class NoValueError(AdapterError):
-    """The scene ran, and what it did has no number."""
+    """The scene ran, and its motion has no number."""
 
     state = "no value"
 
@@ -91,9 +91,9 @@ class Laboratory:
 
     Args:
         program: Adapter and interpreter.
-        description: What the adapter says about itself.
+        description: The adapter's description of itself.
         setting: Row of its settings.
-        log: File for what its processes print.
+        log: File for the output of its processes.
         seconds: Time limit of a scene [s].
         budget: Limit of the CPU time of all scenes together [s].
         softer: Factor on the bending stiffness of each scene, which calibrates a simulator whose

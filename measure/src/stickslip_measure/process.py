@@ -24,7 +24,7 @@ FRAMES_AT_ONCE = 16
 """Steps in a request: few, so that a simulator that is slow differs from one that hangs."""
 
 LOG_LINES = 3
-"""Last lines of what a crashed process printed that its reason quotes."""
+"""Number of last lines of a crashed process that its reason quotes."""
 
 LOG_LENGTH = 240
 """Most characters of them."""
@@ -92,7 +92,7 @@ class Program:
 
 @dataclass(frozen=True)
 class Description:
-    """What an adapter says about itself; contract.py has the meanings."""
+    """The description that an adapter gives of itself; contract.py has the meanings."""
 
     name: str
     version: str
@@ -112,7 +112,7 @@ class AdapterProcess:
         program: Adapter and interpreter.
         log: File for everything that the process prints.
         seconds: Time limit of the whole process [s].
-        budget: Limit of its CPU time [s], which does not depend on what else the machine does.
+        budget: Limit of its CPU time [s], which does not depend on other programs.
     """
 
     def __init__(
@@ -214,7 +214,7 @@ class AdapterProcess:
 
 
 def describe(program: Program, log: Path, seconds: float) -> Description:
-    """Return what an adapter says about itself.
+    """Return the description that an adapter gives of itself.
 
     Raises:
         AdapterError: It cannot be imported, or lacks an attribute.

@@ -30,7 +30,7 @@ def check_frames(frames: Sequence[int], vertices: NDArray[np.intp], run: ClothRu
 
 
 def points_at(frames: Sequence[int], vertices: NDArray[np.intp], points: Floats) -> Floats:
-    """Return what a run has (frame, vertex, xyz) at some frames and vertices: (T, K, 3)."""
+    """Return an array of a run (frame, vertex, xyz) at some frames and vertices: (T, K, 3)."""
     return np.asarray(points[list(frames)][:, vertices])
 
 

@@ -1,4 +1,4 @@
-"""What the adapters of Newton's solvers share: bodies, held vertices, steps."""
+"""The common part of the adapters of Newton's solvers: bodies, held vertices, steps."""
 
 from typing import Any
 

@@ -26,7 +26,7 @@ A box thinner than two of these radii has half its shortest edge as the radius.
 RADIUS_LEAST: float = radius_least
 """Least radius of a ball, a rod or the edges of a box, over the side of a cell.
 
-On what is sharper friction is not right, so `Cloth` refuses it (`contact/bodies.hpp`).
+On a sharper body friction is not right, so `Cloth` refuses it (`contact/bodies.hpp`).
 """
 
 COMPRESSION: float = compression
@@ -40,10 +40,10 @@ class Friction(NamedTuple):
     """Coefficients of friction of two things."""
 
     kinetic: float
-    """Of what slides."""
+    """While the contact slides."""
 
     static: float
-    """Of what rests."""
+    """While the contact rests."""
 
 
 BodyTuple = tuple[int, list[float], Floats, float, Floats, Floats, list[float]]
@@ -63,7 +63,7 @@ class Body:
     mu: ArrayLike
     """Coefficient of friction with the cloth, 0 ... 10, or with each of its sheets: (S,).
 
-    With `mu_static` it is the kinetic one, of what slides.
+    With `mu_static` it is the kinetic one, of contacts that slide.
     """
 
     shape: int = 0
@@ -88,7 +88,7 @@ class Body:
     """Axes of the body in the world, as columns: (3, 3)."""
 
     mu_static: ArrayLike | None = None
-    """Coefficient of friction of what does not slide yet, as `mu`, and at least that.
+    """Coefficient of friction of contacts at rest, as `mu`, and at least that.
 
     None is `mu`. `contact/friction_cones.hpp` has the rules.
     """
@@ -142,10 +142,10 @@ def check_friction(mu: ArrayLike) -> None:
 
 
 def check_static_friction(mu: ArrayLike, mu_static: ArrayLike | None) -> None:
-    """Check the coefficients of friction of what does not slide yet, if there are any.
+    """Check the coefficients of friction of contacts at rest, if there are any.
 
     Raises:
-        ValueError: One is below that of what slides, or out of range, or the shapes differ.
+        ValueError: A value is below that of sliding, or out of range, or the shapes differ.
     """
     if mu_static is None:
         return
@@ -316,7 +316,7 @@ class SelfContact:
     """
 
     mu_static: float | ArrayLike | None = None
-    """Coefficient of friction of what does not slide yet, as `mu`, and at least that.
+    """Coefficient of friction of contacts at rest, as `mu`, and at least that.
 
     None is `mu`.
     """
@@ -403,7 +403,7 @@ class Surface:
     """
 
     mu_static: float | ArrayLike | None = None
-    """Coefficient of friction of what does not slide yet, as `mu`, and at least that.
+    """Coefficient of friction of contacts at rest, as `mu`, and at least that.
 
     None is `mu`.
     """

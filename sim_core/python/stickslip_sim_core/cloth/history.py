@@ -1,4 +1,4 @@
-"""The history of a run: what each step measured, in the order of the steps.
+"""The history of a run: the measured numbers of each step, in the order of the steps.
 
 A share over a whole run becomes small if the run goes on calmly after its worst moment. The checks
 therefore judge the worst stretch of steps, which no later step can improve.

@@ -51,7 +51,7 @@ class SolverSettings:
     second_order: bool = False
     """Whether vertices that touch nothing move with second order in time.
 
-    Otherwise steps damp what swings, as implicit Euler does.
+    Otherwise steps damp a swing, as implicit Euler does.
     """
 
     step_error: float | None = STEP_ERROR

@@ -43,7 +43,7 @@ def _no_points() -> Floats:
 
 @dataclass(frozen=True)
 class DriveRates:
-    """Derivatives of what drives the cloth at one time by a parameter.
+    """Derivatives of the driving motions and forces at one time by a parameter.
 
     Empty arrays are zero.
 
@@ -93,7 +93,7 @@ class Term:
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of a run: numbers of the cloth that it changes, and what it moves.
+    """A parameter of a run: numbers of the cloth that it changes, and parts that it moves.
 
     The constructors below make a parameter of one thing: `friction`, `pair_friction`,
     `fabric_factor` and `drive`.
@@ -106,7 +106,7 @@ class Parameter:
         return [term.as_tuple() for term in self.terms]
 
     def rates_at(self, time: float) -> DriveRates:
-        """Return how what drives the cloth depends on the parameter at a time [s]."""
+        """Return the derivatives of the drive by the parameter at a time [s]."""
         return self.rates(time) if self.rates else DriveRates()
 
     def check_bodies(self, bodies: int) -> None:
@@ -155,6 +155,6 @@ def drive(rates: Callable[[float], DriveRates]) -> Parameter:
     """Return a parameter that moves held vertices, bodies or gravity.
 
     Args:
-        rates: Function of the time [s] that returns the derivatives of what drives the cloth.
+        rates: Function of the time [s] that returns the derivatives of the drive.
     """
     return Parameter(rates=rates)

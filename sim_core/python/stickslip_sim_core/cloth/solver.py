@@ -173,7 +173,7 @@ class Cloth:
         self.total = StepReport()
         """Report of all steps: counts, least distances, and in `seen` the values for `checks`."""
         self.history = StepHistory()
-        """What each step measured, for `checks` that judge the worst stretch of a run."""
+        """Measured numbers of each step, for `checks` that judge the worst stretch of a run."""
         self.spent = 0.0
         """Most iterations in a second of scene time over the preset's `newton_per_second`.
 
@@ -514,7 +514,7 @@ class Cloth:
         bits with and without.
 
         Raises:
-            ValueError: A parameter is friction of what does not touch the cloth.
+            ValueError: A parameter is friction of a thing that does not touch the cloth.
         """
         self._parameters = tuple(parameters)
         self._solver.follow([parameter.as_tuples() for parameter in self._parameters])

@@ -1,7 +1,7 @@
 """Cusick's drape test: a disc of cloth hangs over a smaller pedestal [BS 5058:1973].
 
-The disc of 30 cm lies between two plates of 18 cm, and what overhangs falls into folds. The drape
-coefficient is the share of the overhanging ring that its shadow from above covers:
+The disc of 30 cm lies between two plates of 18 cm, and its overhanging ring falls into folds. The
+drape coefficient is the share of the ring that its shadow from above covers:
 
     DC = (A - pi r^2) / (pi R^2 - pi r^2),   r = 9 cm, R = 15 cm
 """

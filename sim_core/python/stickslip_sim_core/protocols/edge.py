@@ -102,7 +102,7 @@ def pull_needed(hanging: float, flat: float, radius: float, mu: float) -> float:
 
 @dataclass(frozen=True)
 class Table:
-    """What a strip is pulled over."""
+    """The body that a strip is pulled over."""
 
     bodies: Sequence[Body]
     surfaces: Sequence[Surface]

@@ -1,4 +1,4 @@
-"""Motion: how far cloth falls, how far it slides until it rests, and what its impact bears.
+"""Motion: how far cloth falls, how far it slides until it rests, and the impulse of its impact.
 
 All have closed forms. The step control of the preset chooses the steps, as in scenes.
 """

@@ -115,7 +115,7 @@ class ParameterFit:
     """
 
     correlation: Floats
-    """Correlations of the errors of log gamma, phi0 and phi1, (3, 3); NaN for what was given."""
+    """Correlations of the errors of log gamma, phi0 and phi1, (3, 3); NaN for given ones."""
 
     residual: float
     """Root mean square distance per coordinate between the hung rod and the centreline [L]."""

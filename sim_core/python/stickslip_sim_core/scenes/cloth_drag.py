@@ -139,7 +139,7 @@ class Drag:
     fabric: Fabric
     mu: float
     static_ratio: float = 1.0
-    """Coefficient of friction of what rests, over `mu`; 1 ... 3."""
+    """Coefficient of friction at rest, over `mu`; 1 ... 3."""
 
     mesh: meshes.Mesh
     self_friction: float | None = SELF_FRICTION
@@ -259,7 +259,7 @@ def family(
     Args:
         material: One of `fabric_names()`, or a fabric.
         mu: Coefficient of friction between cloth and floor, 0 ... 10.
-        static_ratio: Coefficient of friction of what rests, over `mu`; 1 ... 3.
+        static_ratio: Coefficient of friction at rest, over `mu`; 1 ... 3.
         density: Factor of the mass per area of the fabric, 0.1 ... 10.
         bending: Factor of its bending rigidity, likewise.
         stretching: Factor of its stretching stiffness, likewise.

@@ -185,7 +185,7 @@ def _last_change(gravity: "_Gravity", sheets: Sequence[Sheet], things: Sequence[
 
 
 def _tracks(things: Sequence[Thing], held: _Held) -> dict[str, Callable[[float], NDArray[Any]]]:
-    """Return what a run records of bodies and holders at the time of each frame, by name."""
+    """Return the recorded arrays of bodies and holders at the time of each frame, by name."""
     tracks: dict[str, Callable[[float], NDArray[Any]]] = {
         f"{body.name}.vertices": body.surface.at
         for body in things

@@ -1,4 +1,4 @@
-"""Evenness of what drives the cloth, in a step that goes on beyond the last frame.
+"""Evenness of the driving motions, in a step that goes on beyond the last frame.
 
 The solver measures how far holders, bodies and surfaces are from an even motion in each step. A
 step does not end at the last frame, and what happens after the frame is no part of the run: a

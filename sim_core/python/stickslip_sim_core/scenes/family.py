@@ -41,7 +41,7 @@ AT_REST_STEPS = 3
 
 
 _Rough: TypeAlias = Body | SelfContact | Surface
-"""What has coefficients of friction."""
+"""A thing with coefficients of friction."""
 
 
 class SceneParameter(NamedTuple):
@@ -158,7 +158,7 @@ class SceneFamily:
 
 
 class Comparison:
-    """Two scenes of a family, and what differs between them per unit of the parameter."""
+    """Two scenes of a family, and their differences per unit of the parameter."""
 
     def __init__(self, name: str, low: Scene, high: Scene, width: float) -> None:
         self._name, self._low, self._high, self._width = name, low, high, width
@@ -314,7 +314,7 @@ class Comparison:
 
 
 def _static_friction(thing: _Rough) -> ArrayLike | None:
-    """Return the friction of what rests, or None if it is that of what slides."""
+    """Return the friction at rest, or None if it is that of sliding."""
     if thing.mu_static is None or np.array_equal(thing.mu_static, thing.mu):
         return None
     return thing.mu_static
@@ -334,7 +334,7 @@ def rest_rates(
 
     Args:
         hanging: The sheet, which hangs at rest.
-        terms: What the parameter changes in its fabric.
+        terms: Changes of its fabric by the parameter.
         drive: How the held vertices and gravity depend on the parameter.
         kernel: Level of the kernels, see `Cloth`.
     """

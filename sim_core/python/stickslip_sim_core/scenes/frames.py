@@ -29,7 +29,7 @@ Bodies = Callable[[float], Sequence[Body]]
 
 
 class Frame(NamedTuple):
-    """What is shown of a cloth at one time."""
+    """The shown state of a cloth at one time."""
 
     positions: Floats
     """(V, 3) [m]"""

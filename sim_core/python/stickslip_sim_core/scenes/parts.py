@@ -334,7 +334,7 @@ def thing(name: str, document: Document, friction: Sequence[Friction], *, cell: 
 
 
 def _with_static_friction(body: Body, mu_static: Sequence[float] | None) -> Body:
-    """Return a body with other friction at rest; None is that of what slides."""
+    """Return a body with other friction at rest; None is that of sliding."""
     return body if mu_static is None else replace(body, mu_static=mu_static)
 
 

@@ -222,7 +222,7 @@ class Scene:
     """Sheets that hang at the start."""
 
     sensitivities: Sequence[SceneSensitivity] = ()
-    """What a run is differentiated by: see `SceneFamily.differentiated`."""
+    """The parameters of the derivatives of a run: see `SceneFamily.differentiated`."""
 
     def begin(self) -> Begun:
         """Return the cloth at the start of the scene, and its holders.

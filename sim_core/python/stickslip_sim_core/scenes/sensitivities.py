@@ -43,7 +43,7 @@ class SceneSensitivity:
     """Size of the parameter, in its unit: the unit of changes that count as small."""
 
     terms: tuple[Term, ...]
-    """What the parameter changes in the cloth."""
+    """Changes of the cloth by the parameter."""
 
     start: Floats
     """Derivative of the positions at the start: (V, 3) [m per unit]."""
