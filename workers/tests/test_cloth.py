@@ -103,6 +103,7 @@ class Core:
                 "bias": 1e-5,
                 "areal_density": fabric("gray-interlock").density,
                 "bending_rigidity": np.diag(fabric("gray-interlock").rigidity).tolist(),
+                "softening_length": 0.0,
                 "stretching_stiffness": fabric("gray-interlock").stretching[0].tolist(),
             },
             self_intersections=(np.arange(scene.frames) * 1000).astype(np.int32),
@@ -145,6 +146,7 @@ def test_a_trajectory_becomes_a_record_and_labels(core: Core, store: DirectorySt
     assert result.output.labels == {
         "areal_density": fabric("gray-interlock").density,
         "bending_rigidity": np.diag(fabric("gray-interlock").rigidity).tolist(),
+        "softening_length": 0.0,
         "stretching_stiffness": fabric("gray-interlock").stretching[0].tolist(),
         "kernel": "baseline",
         "bias_side": -1,

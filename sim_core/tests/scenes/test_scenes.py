@@ -10,12 +10,20 @@ from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.solver import GRAVITY
 from stickslip_sim_core.scenes import cloth_drag, holders
+from stickslip_sim_core.scenes.scene import fabric_labels
 
 pytestmark = pytest.mark.physics
 
 DURATION = cloth_drag.duration_of(cloth_drag.DROP) + cloth_drag.LEGS * cloth_drag.duration_of(
     cloth_drag.DRAG
 )  # s
+
+
+def test_the_label_of_softening_is_a_length_and_zero_without_it() -> None:
+    constant = fabric("gray-interlock")
+    softening = replace(constant, softening=400.0)
+    assert fabric_labels(constant)["softening_length"] == 0.0
+    assert fabric_labels(softening, "scarf.")["scarf.softening_length"] == pytest.approx(2.5e-3)
 
 
 @pytest.fixture(scope="module")

@@ -406,6 +406,8 @@ def fabric_labels(made: Fabric, prefix: str = "") -> dict[str, Any]:
     return {
         f"{prefix}areal_density": made.density,
         f"{prefix}bending_rigidity": np.diag(made.rigidity).tolist(),
+        # The inverse of the card's number: constant bending is its limit 0, and not infinity.
+        f"{prefix}softening_length": 0.0 if made.softening is None else 1.0 / made.softening,
         f"{prefix}stretching_stiffness": made.stretching[0].tolist(),
     }
 

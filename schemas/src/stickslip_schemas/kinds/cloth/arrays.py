@@ -142,9 +142,11 @@ def fabric_arrays(prefix: str = "") -> tuple[ArrayLayout, ...]:
     # Numbers of the fabric after its factors, so that a network can learn them.
     rigidity = "plate rigidities along the warp, along the weft, and of twist [N m]"
     stiffness = "k0, k1, k2, k3 of [Wang et al. 2011] at no strain [N/m]"
+    softening = "|b|/D0 of bending that softens, 1 over the card's softening; 0 if constant [m]"
     return (
         array(f"{prefix}areal_density", "mass per area [kg/m^2]"),
         array(f"{prefix}bending_rigidity", rigidity, of={"direction": 3}),
+        array(f"{prefix}softening_length", softening),
         array(f"{prefix}stretching_stiffness", stiffness, of={"coefficient": 4}),
     )
 
