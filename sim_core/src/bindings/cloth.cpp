@@ -12,6 +12,7 @@
 #include <map>
 #include <tuple>
 
+#include "cloth/constants.hpp"
 #include "cloth/mesh.hpp"
 #include "cloth/solver.hpp"
 
@@ -117,6 +118,7 @@ void bind_cloth(nb::module_& m) {
           "[J].");
   m.attr("radius_least") = radius_least;
   m.attr("compression") = compression;
+  m.attr("step_iterations_max") = control::iterations_max;
   nb::class_<StepReport>(m, "StepReport", "How a step of cloth went, or several.")
       .def(nb::init<>())
       .def("add", &StepReport::add, "later"_a, "Add the report of later steps.")

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 
 #include "cloth/mesh.hpp"
 #include "cloth/stepping.hpp"
@@ -133,7 +134,8 @@ StepReport ClothSolver::step(double dt, const Points3& gravity, const Points3& h
                              const Points3& surfaces, const std::vector<Body>& bodies,
                              double damping, const std::vector<DriveRates>& rates) {
   if (!impl_->stepper.started()) refuse_sharp(bodies, cell_of(impl_->mesh));
-  return impl_->stepper.step(dt, {gravity, held, surfaces, bodies, damping, rates});
+  constexpr int unlimited = std::numeric_limits<int>::max();
+  return impl_->stepper.step(dt, {gravity, held, surfaces, bodies, damping, rates}, unlimited);
 }
 
 void ClothSolver::follow(const std::vector<SensitivityParameter>& parameters) {

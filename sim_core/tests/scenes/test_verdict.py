@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from stickslip_sim_core import Body, box, fabric, plane, preset_named
+from stickslip_sim_core import Body, SelfContact, box, fabric, plane, preset_named
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import checks, meshes
 from stickslip_sim_core.scenes.holders import Holder
@@ -114,6 +114,40 @@ def test_it_is_not_valid_for_what_was_squeezed() -> None:
 
 def test_a_step_that_may_not_fail_is_given_up() -> None:
     assert _iterations(squeezed(), may_fail=False) < _iterations(squeezed(), may_fail=True)
+
+
+def crushed() -> Scene:
+    """A napkin that lies between four walls, which close until there is no room left for it."""
+    mesh = meshes.grid(0.1, 0.1, 8, 8)
+    # Heights by a fixed rule say to which side each part gives way.
+    height = 1.05e-3 + 5e-5 * np.cos(150.0 * mesh.rest[:, 0]) * np.cos(110.0 * mesh.rest[:, 1])
+    start = np.column_stack([mesh.rest, height])
+    gravity = np.tile([0.0, 0.0, -9.81], (len(start), 1))
+
+    def bodies(time: float) -> list[Body]:
+        away = 0.252 - 0.2 * time
+        sides = [(away, 0.0), (0.0, away), (-away, 0.0), (0.0, -away)]
+        walls = [box(0.3, (0.2, 0.2, 0.2), rounding=0.0115, origin=(*at, 0.0)) for at in sides]
+        return [plane(0.5), *walls]
+
+    return Scene(
+        mesh=mesh,
+        fabrics=[fabric("gray-interlock")],
+        preset=preset_named("certified"),
+        start=start,
+        motion=lambda time: (gravity, bodies(time)),
+        self_contact=SelfContact(0.5),
+        frames=41,
+        frame_rate=40.0,
+    )
+
+
+def test_a_step_without_a_solution_ends_the_run() -> None:
+    run = crushed().run()
+    assert not run.valid
+    assert run.labels["budget"] > 1.0
+    # The last try of the step may go beyond.
+    assert run.labels["budget"] < 1.5
 
 
 def _iterations(scene: Scene, *, may_fail: bool) -> int:

@@ -107,10 +107,11 @@ CHECKS = (
     Check(
         "budget",
         "most iterations of Newton's method in a second of scene time, over the 50,000 at "
-        "which the run ends",
+        "which the run ends, or for one step, over the 1,000 at which it ends",
         lambda seen: seen.cloth.spent,
         1.0,
-        "where holders, bodies and cloth cannot all have their way, steps take ever more",
+        "where holders, bodies and cloth cannot all have their way, steps take ever more, and some "
+        "have no solution; steps that end well took up to 212",
     ),
     Check(
         "crossings",

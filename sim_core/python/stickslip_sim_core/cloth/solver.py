@@ -16,6 +16,7 @@ from stickslip_sim_core._sim_core import (
     SensitivityReport,
     StepReport,
     sheet_count,
+    step_iterations_max,
 )
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth.contact import (
@@ -175,9 +176,10 @@ class Cloth:
         self.history = StepHistory()
         """Measured numbers of each step, for `checks` that judge the worst stretch of a run."""
         self.spent = 0.0
-        """Most iterations in a second of scene time over the preset's `newton_per_second`.
+        """Most iterations of Newton's method over those that are allowed.
 
-        Beyond 1, `advance` stops.
+        The allowed ones are 1,000 for a step, and the preset's `newton_per_second` in a second of
+        scene time. Beyond 1, `advance` stops.
         """
         self._spent = 0.0
         self.gravity = np.tile([0.0, 0.0, -GRAVITY], (len(mesh.rest), 1))
@@ -452,16 +454,20 @@ class Cloth:
             self.time, report = self._solver.advance(self.time, event, drive, track, may_fail())
             self.total.add(report)
             self.history.add(self.time - self._before[0], report)
-            # The sum of iterations drains at the allowed rate. A few hard steps therefore stay
-            # within the budget of a second, and many hard steps in a row exceed it.
-            if self.preset.step_error is not None:
-                allowed = self.preset.newton_per_second
-                self._spent = (
-                    max(0.0, self._spent - allowed * (self.time - self._before[0])) + report.newton
-                )
-                self.spent = max(self.spent, self._spent / allowed)
+            self._spend(self.time - self._before[0], report.newton)
             if is_over():
                 return
+
+    def _spend(self, duration: float, iterations: int) -> None:
+        """Count the iterations of a step of `duration` [s]."""
+        self.spent = max(self.spent, iterations / step_iterations_max)
+        if self.preset.step_error is None:
+            return
+        # The sum of iterations drains at the allowed rate. A few hard steps therefore stay within
+        # the budget of a second, and many hard steps in a row exceed it.
+        allowed = self.preset.newton_per_second
+        self._spent = max(0.0, self._spent - allowed * duration) + iterations
+        self.spent = max(self.spent, self._spent / allowed)
 
     @property
     def last_begin(self) -> float:

@@ -163,7 +163,7 @@ CHECKS: Mapping[str, tuple[str, float | None]] = MappingProxyType(
             1.0,
         ),
         "budget": (
-            "most iterations in a second of the scene over those that the preset allows",
+            "most iterations in a second of the scene, or for a step, over the allowed ones",
             1.0,
         ),
         "crossings": ("pairs of triangles that cross in a frame, where cloth touches itself", 0.0),
