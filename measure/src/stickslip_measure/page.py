@@ -317,6 +317,7 @@ th, td { border: 1px solid #c9ced3; padding: .25rem .4rem; text-align: left; }
 .none, .absent { color: #59636e; }
 .reason { max-width: 22rem; }
 section { border-top: 1px solid #c9ced3; margin-top: 1.2rem; }
+li { overflow-wrap: anywhere; }  /* addresses of sources are long */
 svg { background: #fff; max-width: 100%; height: auto; }
 a { color: inherit; }
 /* On a narrow screen each simulator is a card, and each entry has the name of its column. */
