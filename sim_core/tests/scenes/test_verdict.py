@@ -108,7 +108,8 @@ def squeezed() -> Scene:
 
 def test_it_is_not_valid_for_what_was_squeezed() -> None:
     run = squeezed().run()
-    assert run.code in {"penetration", "contact_gain", "passages", "unconverged"}
+    # A step without a solution ends the run, if nothing else did before.
+    assert run.code in {"penetration", "contact_gain", "passages", "unconverged", "budget"}
     assert run.times[-1] < 0.1
 
 
