@@ -11,8 +11,8 @@ The last two are below 1 if a quota or other programs leave less than a CPU to a
 quota of one CPU, a process that runs alone has all of it, and each of two has half.
 
 Other programs spoil a measurement: they take CPUs, and the drag itself needs more CPU time beside
-them. A worker is often measured while Ray starts. So a speed is only kept if the CPUs were quiet,
-and until then the worker measures again when it is idle (`SpeedGauge`).
+them. A worker is often measured while Ray starts. Such a speed is stored as disturbed: workers use
+it, and measure again when they are idle and the CPUs are quiet (`SpeedGauge`).
 
     python -m stickslip_workers.machine     runs the drag and prints its times as JSON
 """
@@ -54,7 +54,7 @@ A quota shows with two, and the measurement stays below 2 CPU s.
 """
 
 QUIET_SHARE = 0.1
-"""Share of all CPUs that other programs may use during a measurement that is kept.
+"""Share of all CPUs that other programs may use during a measurement that is not disturbed.
 
 While Ray and other programs used two CPUs of two, the drag took three times its CPU time.
 """
@@ -71,6 +71,7 @@ class StoredSpeed(Document):
 
     machine: str
     speed: MachineSpeed
+    is_disturbed: bool = False
 
 
 class DragTimes(Document):
@@ -157,10 +158,14 @@ class SpeedGauge:
         self._processes = min(slots, MAX_PROCESSES)
         self._machine = machine_name()
         self._meter = CpuMeter()
-        stored = self._read()
-        self.is_settled = stored is not None
+        self.is_settled = False
         """Whether the speed needs no further measurement."""
-        self.speed = stored or self._measure()
+        stored = self._read()
+        if stored is None:
+            self.speed = self._measure()
+        else:
+            self.speed = stored.speed
+            self.is_settled = not stored.is_disturbed
 
     def settle(self) -> bool:
         """Measure a disturbed speed again if the CPUs have been quiet; return whether it did so.
@@ -175,7 +180,7 @@ class SpeedGauge:
         self._meter = CpuMeter()
         return was_quiet
 
-    def _read(self) -> MachineSpeed | None:
+    def _read(self) -> StoredSpeed | None:
         """Return the stored speed of this machine."""
         try:
             stored = StoredSpeed.model_validate_json(self._file.read_bytes())
@@ -186,10 +191,10 @@ class SpeedGauge:
                 "%s is not the speed of a machine, and is measured again: %s", self._file, error
             )
             return None
-        return stored.speed if stored.machine == self._machine else None
+        return stored if stored.machine == self._machine else None
 
     def _measure(self) -> MachineSpeed:
-        """Measure the speed, and store it if other programs left the CPUs alone."""
+        """Measure the speed, and store it with whether other programs disturbed it."""
         meter = CpuMeter()
         try:
             speed = measure_speed(self._processes)
@@ -199,9 +204,8 @@ class SpeedGauge:
             return MachineSpeed()
         other_share = meter.other_share
         self.is_settled = other_share <= QUIET_SHARE
-        if self.is_settled:
-            self._store(speed)
-        else:
+        self._store(speed)
+        if not self.is_settled:
             log.info(
                 "other programs used %.0f %% of the CPUs while the speed of this machine was "
                 "measured; it is measured again when they rest",
@@ -210,7 +214,7 @@ class SpeedGauge:
         return speed
 
     def _store(self, speed: MachineSpeed) -> None:
-        document = StoredSpeed(machine=self._machine, speed=speed)
+        document = StoredSpeed(machine=self._machine, speed=speed, is_disturbed=not self.is_settled)
         try:
             self._file.parent.mkdir(parents=True, exist_ok=True)
             self._file.write_text(document.model_dump_json(), encoding="utf-8")
