@@ -224,8 +224,8 @@ def test_a_version_has_a_card_that_is_true(
     assert manifest.builds.simulate in text
     assert "No certificate vouches" in text
     # These are rods: the yarn is compared with, and no cloth.
-    assert "### Against measurements, of 2026-11-28" in text
-    assert "| 250 | 17.4 |" in text
+    assert "### Against measurements, of 2026-11-29" in text
+    assert "| 250 | 17.5 +- 3 |" in text
     assert "gray-interlock" not in text
     monkeypatch.chdir(directory)
     first, second = re.findall(r"```python\n(.*?)```", text, re.DOTALL)

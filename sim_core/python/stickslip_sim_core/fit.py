@@ -245,7 +245,7 @@ def check_scipy() -> None:
         ImportError: It is missing; the message has the way to install it.
     """
     if find_spec("scipy") is None:
-        raise ImportError("a fit needs SciPy: run `pip install 'stickslip-sim-core[fit]'`")
+        raise ImportError("a fit needs SciPy: run `pip install './sim_core[fit]'`")
 
 
 def _count_minima(searches: Sequence[Minimum]) -> int:

@@ -33,10 +33,9 @@ _SECTIONS = {
     ),
     "Datasets": dict.fromkeys(("datasets", "pull", "verify", "sign", "export"), "datasets"),
     "Scenes": {"scene": "specs", "simulate": "specs", "fit": "fitting"},
-    "Rods": {"rods": "rods"},
     "Fabrics": dict.fromkeys(("fabrics", "lab"), "laboratory"),
     "Certificates": dict.fromkeys(("certify", "register", "certificates"), "workers"),
-    "Measurement": {"measure": "measuring"},
+    "Measurement": {"measure": "measuring", "rods": "rods"},
     "Administration": dict.fromkeys(("keys", "projects", "webhooks", "audit-log"), "admin"),
     "Maintenance": dict.fromkeys(("backup", "rm", "gc", "reindex", "scrub"), "maintenance"),
 }

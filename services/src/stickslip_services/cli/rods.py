@@ -33,7 +33,7 @@ def rods() -> None:
 
 
 @rods.command()
-@click.argument("photographs", metavar="PHOTO...", nargs=-1, required=True, type=FILE)
+@click.argument("photographs", metavar="FILES...", nargs=-1, required=True, type=FILE)
 @click.option(
     "--ledge",
     "ledges",

@@ -111,7 +111,7 @@ CHECKS = (
         lambda seen: seen.cloth.spent,
         1.0,
         "where holders, bodies and cloth cannot all have their way, steps take ever more, and some "
-        "have no solution; steps that end well took up to 212",
+        "have no solution; steps that end well took up to 402",
     ),
     Check(
         "crossings",
