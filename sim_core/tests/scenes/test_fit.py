@@ -160,7 +160,7 @@ def test_without_scipy_a_fit_says_how_to_get_it(
     scenes: SceneFamily, run: ClothRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fitting, "find_spec", lambda _name: None)
-    with pytest.raises(ImportError, match=r"pip install 'stickslip-sim-core\[fit\]'"):
+    with pytest.raises(ImportError, match=r"pip install './sim_core\[fit\]'"):
         fit(scenes, [vertices(run)], ["mu"])
 
 
