@@ -6,12 +6,13 @@ several: cloth that falls to another side is another branch. A fit therefore goe
 starts until the observations are explained by their noise, and says how many minima it saw.
 
 A run also depends on the steps that its solver chooses. They are others at each value, so that the
-residual has small jumps. A search ends where the linear model of the residual has no better values
-within the noise, and not where the jumps end. A last run with finer steps says how far steps move
+residual has jumps, which may be larger than the noise lets the values be known. Near a minimum all
+runs of a search therefore repeat the steps of one run. A search ends where the linear model of the
+residual has no better values within the noise. A last run with finer steps says how far steps move
 the values, and the standard deviations have this share. SciPy comes with the extra `fit`.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from typing import Any, NamedTuple, Protocol
@@ -47,6 +48,13 @@ NEAR = 0.1
 Its unit is the standard deviation by the noise. A nearer point is no better known.
 """
 
+COARSE = 0.1
+"""Share of the residual's square that the linear model can take away at which steps are fixed.
+
+Steps that were chosen further away would not suit the minimum. The jumps of free steps are smaller
+than this where steps are as exact as the noise.
+"""
+
 AT_BOUND = 2e-3
 """Relative distance from a bound within which a value is held by the bound."""
 
@@ -58,6 +66,12 @@ The error of a step grows with the square of its length, so steps are half as lo
 
 STEPS_SHARE = 2.0
 """Error of a run over its difference from one with steps half as long, for first order in time."""
+
+LEAST_EFFECT = 1e-3
+"""Change of the residual by all of a parameter's range, below which it has no effect.
+
+It is to first order, and its unit is the standard deviation of the noise. Rounding leaves 1e-8.
+"""
 
 RUNS_MAX = 15
 """Runs from one start: a smooth residual takes 7 to 13.
@@ -164,7 +178,10 @@ class Fit:
     @property
     def warning(self) -> str:
         """Why the values may be wrong, or an empty text."""
-        counted = f"the searches from {len(self.searches)} starts ended in {self.minima} minima"
+        starts = len(self.searches)
+        begun = "the search from 1 start" if starts == 1 else f"the searches from {starts} starts"
+        ended = "1 minimum" if self.minima == 1 else f"{self.minima} minima"
+        counted = f"{begun} ended in {ended}"
         several = f"several minima: {counted}, and " if self.minima > 1 else ""
         if not self.converged:
             return (
@@ -207,8 +224,8 @@ def fit(
 
     Raises:
         ImportError: SciPy is missing.
-        ValueError: An argument breaks its rule, there are fewer observations than parameters, a
-            parameter has no effect, or no start has a valid run.
+        ValueError: An argument breaks its rule, there are fewer observations than parameters, or
+            at each start a parameter has no effect or the run is not valid.
     """
     check_scipy()
     search = _Search(scenes, observations, parameters, bounds or {})
@@ -221,7 +238,7 @@ def fit(
     # A search that converged is better than one that did not, whatever it leaves.
     best = min(searches, key=lambda minimum: (not minimum.is_explained, minimum.mean_square))
     if not np.isfinite(best.mean_square):
-        raise ValueError(f"start: no run is valid from any of them: {best.message}")
+        raise ValueError(best.message)
     by_noise = search.covariance(best)
     by_steps = search.shift_by_steps(best)
     covariance = by_noise + np.nan_to_num(np.outer(by_steps, by_steps))
@@ -268,6 +285,8 @@ class _Run(NamedTuple):
     """By each parameter: (N, P)."""
     reason: str
     """Why the run is not valid, or empty."""
+    step_ends: Floats
+    """Ends of the solver's steps: (steps,) [s]."""
 
 
 class _Search:
@@ -296,7 +315,11 @@ class _Search:
         self._low, self._high = np.array([self._bounds(name, bounds) for name in names]).T
         self._is_log = self._low > 0.0
         # A search asks for the residual and then for the Jacobian of the same point.
-        self._runs: dict[tuple[float, ...], _Run] = {}
+        self._runs: dict[tuple[tuple[float, ...], tuple[float, ...]], _Run] = {}
+        # The steps that all runs of a search repeat near its minimum.
+        self._step_ends: Floats | None = None
+        # The runs in which searches ended, by their values.
+        self._minima: dict[tuple[float, ...], _Run] = {}
 
     def _bounds(self, name: str, bounds: Mapping[str, tuple[float, float]]) -> tuple[float, float]:
         known = self._scenes.parameters[name]
@@ -332,38 +355,37 @@ class _Search:
 
     def minimum(self, start: Mapping[str, float]) -> Minimum:
         """Return where the search from a start ends."""
-        from scipy.optimize import least_squares
-
         begin = np.array([start[name] for name in self._names])
         if not ((begin >= self._low) & (begin <= self._high)).all():
             raise ValueError(f"start: must be within the bounds, got {dict(start)}")
         runs_before = len(self._runs)
+        self._step_ends = None
         first = self._run(start)
         if first.reason:
-            return Minimum(start, start, np.inf, 1, False, False, first.reason)
+            reason = f"start: no run is valid from any of them: {first.reason}"
+            return Minimum(start, start, np.inf, 1, False, False, reason)
+        effects = np.linalg.norm(first.jacobian, axis=0) * (self._high - self._low)
         without = [
-            name for name, by in zip(self._names, first.jacobian.T, strict=True) if not by.any()
+            name for name, effect in zip(self._names, effects, strict=True) if effect < LEAST_EFFECT
         ]
         if without:
-            raise ValueError(f"parameters: {without[0]} has no effect on the observations")
-        solution: Any = least_squares(
-            self._residual,
-            # The search needs a start between the bounds, and not on one of them.
-            self._transformed(begin.clip(1.001 * self._low, 0.999 * self._high)),
-            jac=self._by_transformed,
-            bounds=(self._transformed(self._low), self._transformed(self._high)),
-            x_scale="jac",
-            xtol=TOLERANCE,
-            ftol=TOLERANCE,
-            max_nfev=RUNS_MAX,
-            callback=self._stop_near,
-        )
+            reason = f"parameters: {without[0]} has no effect on the observations"
+            return Minimum(start, start, np.inf, 1, False, False, reason)
+        # The search needs a start between the bounds, and not on one of them.
+        inside = self._transformed(begin.clip(1.001 * self._low, 0.999 * self._high))
+        solution = self._descended(inside, lambda z: self._gain(z) <= COARSE, RUNS_MAX)
+        free_runs = len(self._runs) - runs_before
+        if free_runs < RUNS_MAX and self._gain(solution.x) <= COARSE:
+            self._step_ends = self._at(solution.x).step_ends
+            solution = self._descended(solution.x, self._is_near, RUNS_MAX - free_runs)
+        values = self._values(solution.x)
+        self._minima[tuple(values.values())] = self._run(values)
         freedom = max(self._count - len(self._names), 1)
         mean_square = 2.0 * float(solution.cost) / freedom
         converged = self._is_near(solution.x)
         return Minimum(
             start,
-            self._values(solution.x),
+            values,
             mean_square,
             len(self._runs) - runs_before,
             converged,
@@ -371,14 +393,43 @@ class _Search:
             str(solution.message),
         )
 
-    def _stop_near(self, z: Floats) -> None:
-        """End a search at its minimum: further runs would follow the jumps of the steps."""
-        if self._is_near(z):
-            raise StopIteration
+    def _descended(self, z: Floats, is_over: Callable[[Floats], bool], runs: int) -> Any:
+        """Return the solution of least squares from a point on."""
+        from scipy.optimize import least_squares
+
+        def stop(z: Floats) -> None:
+            if is_over(z):
+                raise StopIteration
+
+        return least_squares(
+            self._residual,
+            z,
+            jac=self._by_transformed,
+            bounds=(self._transformed(self._low), self._transformed(self._high)),
+            x_scale="jac",
+            xtol=TOLERANCE,
+            ftol=TOLERANCE,
+            max_nfev=runs,
+            callback=stop,
+        )
 
     def _is_near(self, z: Floats) -> bool:
         """Return whether the minimum of the linear model is within `NEAR` standard deviations."""
-        run = self._run(self._values(z))
+        # Noise that is larger than its given size makes the minimum as much less known.
+        excess = max(float(np.mean(self._at(z).residual ** 2)), 1.0)
+        return self._decrease(z) <= NEAR**2 * excess
+
+    def _gain(self, z: Floats) -> float:
+        """Return the share of the residual's square that the linear model can take away."""
+        # Nothing can be taken away from a residual of 0.
+        return self._decrease(z) / (float(np.sum(self._at(z).residual ** 2)) or 1.0)
+
+    def _decrease(self, z: Floats) -> float:
+        """Return how much less the residual's square is at the minimum of the linear model.
+
+        It is also the square of the distance of that minimum, in standard deviations by the noise.
+        """
+        run = self._at(z)
         values = np.array(list(self._values(z).values()))
         down = run.jacobian.T @ run.residual
         # A bound holds a value that the residual pulls over it.
@@ -387,13 +438,10 @@ class _Search:
         is_high = (values >= self._high - width) & (down < 0.0)
         is_free = ~(is_low | is_high)
         J = run.jacobian[:, is_free]
-        squared = down[is_free] @ np.linalg.pinv(J.T @ J) @ down[is_free]
-        # Noise that is larger than its given size makes the minimum as much less known.
-        excess = max(float(np.mean(run.residual**2)), 1.0)
-        return bool(squared <= NEAR**2 * excess)
+        return float(down[is_free] @ np.linalg.pinv(J.T @ J) @ down[is_free])
 
     def _residual(self, z: Floats) -> Floats:
-        return self._run(self._values(z)).residual
+        return self._at(z).residual
 
     def _by_transformed(self, z: Floats) -> Floats:
         values = self._values(z)
@@ -402,7 +450,7 @@ class _Search:
 
     def covariance(self, minimum: Minimum) -> Floats:
         """Return the covariance of the values (P, P) by the noise, and by what it leaves."""
-        J = self._run(minimum.values).jacobian
+        J = self._minima[tuple(minimum.values.values())].jacobian
         return np.asarray(max(minimum.mean_square, 1.0) * np.linalg.pinv(J.T @ J))
 
     def shift_by_steps(self, minimum: Minimum) -> Floats:
@@ -411,26 +459,31 @@ class _Search:
         finer = replace(scene, preset=_finer(scene.preset)).run()
         if not finer.valid:
             return np.full(len(self._names), np.nan)
-        now = self._run(minimum.values)
+        now = self._minima[tuple(minimum.values.values())]
         change = self._compared(finer, []).residual - now.residual
         J = now.jacobian
         return np.asarray(-STEPS_SHARE * np.linalg.pinv(J.T @ J) @ (J.T @ change))
 
+    def _at(self, z: Floats) -> _Run:
+        return self._run(self._values(z))
+
     def _run(self, values: Mapping[str, float]) -> _Run:
-        key = tuple(values.values())
+        steps = () if self._step_ends is None else tuple(self._step_ends)
+        key = (tuple(values.values()), steps)
         if key not in self._runs:
             self._runs[key] = self._simulated(values)
         return self._runs[key]
 
     def _simulated(self, values: Mapping[str, float]) -> _Run:
-        run = self._scenes.with_values(values).differentiated(self._names).run()
+        scene = self._scenes.with_values(values).differentiated(self._names)
+        run = replace(scene, step_ends=self._step_ends).run()
         none = np.full((self._count, len(self._names)), np.nan)
         derivatives = [run.sensitivities[name].positions for name in self._names]
         if not run.valid:
-            return _Run(none[:, 0], none, run.reason)
+            return _Run(none[:, 0], none, run.reason, run.step_ends)
         if not np.isfinite(derivatives).all():
-            return _Run(none[:, 0], none, "the derivatives could not be solved")
-        return _Run(*self._compared(run, derivatives), "")
+            return _Run(none[:, 0], none, "the derivatives could not be solved", run.step_ends)
+        return _Run(*self._compared(run, derivatives), "", run.step_ends)
 
     def _compared(self, run: ClothRun, derivatives: Sequence[Floats]) -> Compared:
         for observation in self._observations:

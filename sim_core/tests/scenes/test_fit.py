@@ -145,6 +145,28 @@ def test_a_search_does_not_follow_jumps_within_the_noise(
     assert abs(answer.values["mu"] - TRUTH["mu"]) < 4.0 * answer.deviations["mu"]
 
 
+def test_runs_near_the_minimum_repeat_the_steps_of_one_run(
+    scenes: SceneFamily, run: ClothRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    repeated: list[Floats | None] = []
+    simulate = Scene.run
+
+    def recorded(scene: Scene) -> ClothRun:
+        repeated.append(scene.step_ends)
+        return simulate(scene)
+
+    monkeypatch.setattr(Scene, "run", recorded)
+    answer = fit(scenes, [vertices(run)], ["mu"])
+    # The last run has finer steps of its own.
+    *searching, finer = repeated
+    assert len(searching) == answer.runs
+    assert searching[0] is None
+    assert finer is None
+    first, *later = [steps for steps in searching if steps is not None]
+    assert later
+    assert all(np.array_equal(steps, first) for steps in later)
+
+
 def test_a_fit_that_leaves_a_residual_says_so(scenes: SceneFamily, run: ClothRun) -> None:
     # No friction within the bounds moves the cloth as this one did.
     answer = fit(scenes, [vertices(run)], ["mu"], bounds={"mu": (0.1, 0.25)}, multistart=2)
@@ -152,7 +174,7 @@ def test_a_fit_that_leaves_a_residual_says_so(scenes: SceneFamily, run: ClothRun
     assert len(answer.searches) == 2
     # Both searches end at the bound, which is one minimum.
     assert answer.warning.startswith(
-        "the searches from 2 starts ended in 1 minima: the best leaves"
+        "the searches from 2 starts ended in 1 minimum: the best leaves"
     )
 
 
@@ -217,6 +239,25 @@ def test_parameter_without_effect_is_refused(scenes: SceneFamily, run: ClothRun)
     early = Vertices([0], run.positions[[0]], ALL, 1e-4)
     with pytest.raises(ValueError, match="mu has no effect on the observations"):
         fit(scenes, [early], ["mu"])
+
+
+def test_effect_of_rounding_counts_as_none(scenes: SceneFamily, run: ClothRun) -> None:
+    # The sheet slides as a whole, and derivatives by bending are of rounding.
+    with pytest.raises(ValueError, match="bending has no effect on the observations"):
+        fit(scenes, [vertices(run)], ["mu", "bending"])
+
+
+def test_fit_goes_on_where_the_first_start_sticks(scenes: SceneFamily, run: ClothRun) -> None:
+    wide = {**scenes.parameters, "mu": SceneParameter(0.6, 0.05, 1.0)}
+    answer = fit(replace(scenes, parameters=wide), [vertices(run)], ["mu"])
+    assert "mu has no effect" in answer.searches[0].message
+    assert abs(answer.values["mu"] - TRUTH["mu"]) < 4.0 * answer.deviations["mu"]
+    assert answer.warning == ""
+
+
+def test_warning_of_one_search_is_in_the_singular(scenes: SceneFamily, run: ClothRun) -> None:
+    answer = fit(scenes, [vertices(run)], ["mu"], bounds={"mu": (0.1, 0.25)}, multistart=1)
+    assert answer.warning.startswith("the search from 1 start ended in 1 minimum: ")
 
 
 def test_observations_of_other_frames_are_refused(scenes: SceneFamily, run: ClothRun) -> None:

@@ -69,6 +69,39 @@ def test_positions_do_not_change() -> None:
     assert np.array_equal(run.positions, family.scene().run().positions)
 
 
+def test_repeated_steps_are_those_of_the_other_run() -> None:
+    family = drag(frames=24)
+    run = family.scene().run()
+    assert len(run.step_ends) == run.labels["steps"]
+    again = replace(family.scene(), step_ends=run.step_ends).run()
+    assert np.array_equal(again.step_ends, run.step_ends)
+    assert again.positions == pytest.approx(run.positions, abs=1e-6)
+    # At another value the step control chooses other steps, unless they are given.
+    other = family.scene(mu=0.31)
+    assert not np.array_equal(other.run().step_ends, run.step_ends)
+    repeated = replace(other, step_ends=run.step_ends).run()
+    assert np.array_equal(repeated.step_ends, run.step_ends)
+    assert repeated.valid
+
+
+def test_steps_go_on_after_the_last_repeated_one() -> None:
+    family = drag(frames=24)
+    run = family.scene().run()
+    half = len(run.step_ends) // 2
+    again = replace(family.scene(), step_ends=run.step_ends[:half]).run()
+    assert np.array_equal(again.step_ends[:half], run.step_ends[:half])
+    assert again.valid
+    assert len(again.positions) == 24
+
+
+def test_repeated_steps_end_at_grasps() -> None:
+    family = cloth_scene.family(document(), PLACES)
+    run = family.scene().run()
+    assert {0.1, 0.15} <= set(run.step_ends.tolist())
+    other = replace(family.scene(lift=0.021), step_ends=run.step_ends).run()
+    assert np.array_equal(other.step_ends, run.step_ends)
+
+
 def test_outcome_has_arrays_and_labels() -> None:
     outcome = drag(frames=24).differentiated(["mu"]).outcome()
     assert outcome.record["positions_by_mu"].shape == outcome.record["positions"].shape

@@ -385,6 +385,7 @@ class Cloth:
         damping: Callable[[float], float] = lambda _time: 0.0,
         is_over: Callable[[], bool] = lambda: False,
         may_fail: Callable[[], bool] = lambda: True,
+        ends: Floats | None = None,
     ) -> None:
         """Take steps until one ends at `end` [s] or later.
 
@@ -405,6 +406,8 @@ class Cloth:
             is_over: Function that returns whether to stop, which is asked after each step.
             may_fail: Function that returns whether a step may stay unconverged, which is asked
                 before each step. Otherwise such a step is given up soon, and no step may follow.
+            ends: Ends of the steps of another run, ascending [s], which this run repeats. After
+                the last of them, or without them, the step control chooses the steps.
 
         Raises:
             ValueError: `event` has passed, or `end` is not a number.
@@ -451,7 +454,12 @@ class Cloth:
             self._before = self.time, self.positions, self.velocities
             if self._parameters:
                 self._before_sensitivities = self.sensitivities, self.velocity_sensitivities
-            self.time, report = self._solver.advance(self.time, event, drive, track, may_fail())
+            known = np.inf if ends is None else _next_of(ends, self.time)
+            if np.isfinite(known):
+                report = self._solver.step(known - self.time, *drive(known))
+                self.time = known
+            else:
+                self.time, report = self._solver.advance(self.time, event, drive, track, may_fail())
             self.total.add(report)
             self.history.add(self.time - self._before[0], report)
             self._spend(self.time - self._before[0], report.newton)
@@ -619,3 +627,9 @@ class Cloth:
         Contact is ignored. The state is stable if the eigenvalue is > 0.
         """
         return float(self._solver.softest(self.positions))
+
+
+def _next_of(ascending: Floats, time: float) -> float:
+    """Return the first of ascending times after a time, or inf."""
+    number = int(np.searchsorted(ascending, time, side="right"))
+    return float(ascending[number]) if number < len(ascending) else np.inf

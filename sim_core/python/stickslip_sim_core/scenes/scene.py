@@ -87,6 +87,9 @@ class ClothRun:
     sensitivities: Mapping[str, Sensitivity] = field(default_factory=dict)
     """Derivatives by the parameters that the scene was differentiated by, by their names."""
 
+    step_ends: Floats = field(default_factory=lambda: np.empty(0))
+    """Ends of the solver's steps: (steps,) [s]."""
+
     @property
     def valid(self) -> bool:
         return not self.code
@@ -115,6 +118,9 @@ class _Frames:
 
     derivatives: list[AtFrame] = field(default_factory=list)
     """Derivatives by the parameters at each frame."""
+
+    step_ends: list[float] = field(default_factory=list)
+    """Ends of the solver's steps [s]."""
 
     rest_time: float = np.nan
     """Time at which everything came to rest and ended the scene [s], or NaN."""
@@ -224,6 +230,13 @@ class Scene:
     sensitivities: Sequence[SceneSensitivity] = ()
     """The parameters of the derivatives of a run: see `SceneFamily.differentiated`."""
 
+    step_ends: Floats | None = None
+    """`ClothRun.step_ends` of another run, whose steps this one repeats.
+
+    Runs with equal steps depend on parameters without the jumps of a step control. None: the step
+    control chooses.
+    """
+
     def begin(self) -> Begun:
         """Return the cloth at the start of the scene, and its holders.
 
@@ -284,6 +297,7 @@ class Scene:
             code=code,
             reason=reason,
             sensitivities=followed.over_frames(frames.derivatives),
+            step_ends=np.array(frames.step_ends),
         )
         # Labels of the scene may depend on the run, such as the side on which a cloth landed.
         return replace(run, labels={**run.labels, **self.labels(run)})
@@ -299,7 +313,7 @@ class Scene:
         # No run of a scene with a reason is valid, so it has its first frame alone.
         for number in range(1, 1 if self.reason else self.frames):
             time = number / self.frame_rate
-            self._advance(begun, time, verdict)
+            self._advance(begun, time, verdict, frames.step_ends)
             # A check has failed, or the budget is spent, and the cloth has not reached the frame.
             if cloth.time < time:
                 break
@@ -346,15 +360,18 @@ class Scene:
             return False
         return float(np.linalg.norm(now - before, axis=1).max()) <= REST_SPEED / self.frame_rate
 
-    def _advance(self, begun: Begun, end: float, verdict: checks.Verdict) -> None:
+    def _advance(
+        self, begun: Begun, end: float, verdict: checks.Verdict, step_ends: list[float]
+    ) -> None:
         """Take steps until one ends at `end` [s] or later, and grasp and release on the way.
 
-        A lost run stops before.
+        Ends of steps are added to `step_ends`. A lost run stops before.
         """
         hands, cloth, followed = begun
         poses = self.poses
 
         def see_step() -> bool:
+            step_ends.append(cloth.time)
             followed.see_step()
             return verdict.see_step()
 
@@ -373,6 +390,7 @@ class Scene:
                 damping=self.damping,
                 is_over=see_step,
                 may_fail=verdict.allows_failure,
+                ends=self.step_ends,
             )
 
     def outcome(self, on_frame: OnFrame | None = None) -> Outcome:
