@@ -201,6 +201,14 @@ def test_the_pins_are_looked_up_on_the_index_alone(
     assert "https://index.test/simple" in listing
 
 
+def test_pins_are_resolved_with_all_that_a_folder_has() -> None:
+    """Tools of development need our distributions, which are no release on the index."""
+    requirements_of = tool_named("release_check").requirements_of
+    assert requirements_of("runtime") == ["requirements.txt"]
+    assert requirements_of("development") == ["requirements.txt", "requirements-dev.txt"]
+    assert requirements_of("blender") == ["requirements-blender.txt"]
+
+
 def test_cpu_time_of_processes_without_a_parent_counts(tmp_path: Path) -> None:
     """Ray's processes outlive the one that starts them, and nobody waits for them."""
     work = (

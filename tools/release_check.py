@@ -63,24 +63,37 @@ def public_environment(python: str) -> dict[str, str]:
     return environment
 
 
+def requirements_of(name: str) -> list[str]:
+    """Return the files whose requirements make an environment.
+
+    A folder may be filled in turns: what the earlier environments installed there is in it, too.
+    """
+    folder = ENVIRONMENTS[name].folder
+    names = list(ENVIRONMENTS)
+    until = names[: names.index(name) + 1]
+    return [
+        ENVIRONMENTS[earlier].requirements
+        for earlier in until
+        if ENVIRONMENTS[earlier].folder == folder
+    ]
+
+
 def resolve_pins(python: str, name: str) -> list[str]:
     """Let pip resolve an environment with public versions alone, and return the local ones.
 
     Nothing is installed. Ends the program if pip finds no solution.
     """
     environment = ENVIRONMENTS[name]
+    requirements: list[str] = []
+    for file in requirements_of(name):
+        requirements += ["--requirement", file]
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / "report.json"
         options = ["--quiet", "--dry-run", "--ignore-installed", "--report", str(report)]
         done = subprocess.run(
             [
                 *(python, "-m", "pip", "install", *options),
-                *(
-                    "--constraint",
-                    environment.constraints,
-                    "--requirement",
-                    environment.requirements,
-                ),
+                *("--constraint", environment.constraints, *requirements),
             ],
             cwd=ROOT,
             env=public_environment(python),
