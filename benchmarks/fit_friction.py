@@ -1,6 +1,6 @@
 """Fit friction and bending of a drag to six noisy instants, from several truths and starts.
 
-    python benchmarks/fit_friction.py MESH [--truths N] [--out RECORD]
+    python benchmarks/fit_friction.py MESH [--truths 0.2 0.6] [--starts 0 2] [--out RECORD]
 
 For each true coefficient of friction, 0.2 to 1, the drag is simulated, and its vertices at six
 instants get noise of 0.5 mm. Fits start from three pairs of mu and factor of bending. A fit is
@@ -35,15 +35,18 @@ BOUNDS = {"mu": (0.05, 2.0), "bending": (0.2, 5.0)}
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("mesh", type=int)
-    parser.add_argument("--truths", type=int, default=len(TRUTHS))
+    parser.add_argument("--truths", type=float, nargs="+", choices=TRUTHS, default=TRUTHS)
+    parser.add_argument(
+        "--starts", type=int, nargs="+", choices=range(len(STARTS)), default=[0, 1, 2]
+    )
     parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
     rows = []
-    for truth in TRUTHS[: arguments.truths]:
+    for truth in arguments.truths:
         scenes = cloth_drag.family("gray-interlock", truth, mesh=arguments.mesh, frames=FRAMES)
         observation = _observed(scenes)
-        for start in STARTS:
-            rows.append(_row(scenes, observation, truth, start))
+        for number in arguments.starts:
+            rows.append(_row(scenes, observation, truth, STARTS[number]))
             print(json.dumps(rows[-1]), flush=True)
     within = sum(row["within_three_deviations"] for row in rows)
     warned = sum(bool(row["warning"]) for row in rows if not row["within_three_deviations"])

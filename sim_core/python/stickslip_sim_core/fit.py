@@ -15,7 +15,7 @@ the values, and the standard deviations have this share. SciPy comes with the ex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 
@@ -74,10 +74,13 @@ It is to first order, and its unit is the standard deviation of the noise. Round
 """
 
 RUNS_MAX = 15
-"""Runs from one start: a smooth residual takes 7 to 13.
+"""Runs from one start: a smooth residual takes 5 to 10."""
 
-Where the residual jumps, a search creeps from one jump to the next, and may end many standard
-deviations off with a residual that noise could explain.
+WORSE_MAX = 3
+"""Runs of a search that may be worse than the best before.
+
+Beside a branch a search creeps along the jump of the residual, and each try to cross it is worse.
+Another start gets further.
 """
 
 
@@ -278,6 +281,14 @@ def _count_minima(searches: Sequence[Minimum]) -> int:
     return len(different)
 
 
+_Key: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]
+"""Values of a run, and the ends of steps that it repeats."""
+
+
+class _JumpsError(Exception):
+    """The residual jumps where the linear model has better values."""
+
+
 class _Run(NamedTuple):
     residual: Floats
     """(N,)"""
@@ -315,7 +326,8 @@ class _Search:
         self._low, self._high = np.array([self._bounds(name, bounds) for name in names]).T
         self._is_log = self._low > 0.0
         # A search asks for the residual and then for the Jacobian of the same point.
-        self._runs: dict[tuple[tuple[float, ...], tuple[float, ...]], _Run] = {}
+        self._runs: dict[_Key, _Run] = {}
+        self._count_of_runs = 0
         # The steps that all runs of a search repeat near its minimum.
         self._step_ends: Floats | None = None
         # The runs in which searches ended, by their values.
@@ -358,7 +370,7 @@ class _Search:
         begin = np.array([start[name] for name in self._names])
         if not ((begin >= self._low) & (begin <= self._high)).all():
             raise ValueError(f"start: must be within the bounds, got {dict(start)}")
-        runs_before = len(self._runs)
+        runs_before = self._count_of_runs
         self._step_ends = None
         first = self._run(start)
         if first.reason:
@@ -373,45 +385,72 @@ class _Search:
             return Minimum(start, start, np.inf, 1, False, False, reason)
         # The search needs a start between the bounds, and not on one of them.
         inside = self._transformed(begin.clip(1.001 * self._low, 0.999 * self._high))
-        solution = self._descended(inside, lambda z: self._gain(z) <= COARSE, RUNS_MAX)
-        free_runs = len(self._runs) - runs_before
-        if free_runs < RUNS_MAX and self._gain(solution.x) <= COARSE:
-            self._step_ends = self._at(solution.x).step_ends
-            solution = self._descended(solution.x, self._is_near, RUNS_MAX - free_runs)
-        values = self._values(solution.x)
+        z, message = self._descended(inside, lambda z: self._gain(z) <= COARSE, RUNS_MAX)
+        free_runs = self._count_of_runs - runs_before
+        if free_runs < RUNS_MAX and self._gain(z) <= COARSE:
+            self._repeat_steps_of(z)
+            z, message = self._descended(z, self._is_near, RUNS_MAX - free_runs)
+        values = self._values(z)
         self._minima[tuple(values.values())] = self._run(values)
         freedom = max(self._count - len(self._names), 1)
-        mean_square = 2.0 * float(solution.cost) / freedom
-        converged = self._is_near(solution.x)
+        mean_square = float(np.sum(self._at(z).residual ** 2)) / freedom
+        converged = self._is_near(z)
         return Minimum(
             start,
             values,
             mean_square,
-            len(self._runs) - runs_before,
+            self._count_of_runs - runs_before,
             converged,
             converged and mean_square <= 1.0 + CHANCE * (2.0 / freedom) ** 0.5,
-            str(solution.message),
+            message,
         )
 
-    def _descended(self, z: Floats, is_over: Callable[[Floats], bool], runs: int) -> Any:
-        """Return the solution of least squares from a point on."""
+    def _repeat_steps_of(self, z: Floats) -> None:
+        """Let all runs from now on repeat the steps of the run at a point."""
+        run = self._at(z)
+        self._step_ends = run.step_ends
+        # The run itself would only be repeated.
+        self._runs[self._key(self._values(z))] = run
+
+    def _descended(
+        self, begin: Floats, is_over: Callable[[Floats], bool], runs: int
+    ) -> tuple[Floats, str]:
+        """Return the best point of a search by least squares, and why it ended."""
         from scipy.optimize import least_squares
+
+        best, least, worse = begin, np.inf, 0
+
+        def residual(z: Floats) -> Floats:
+            nonlocal best, least, worse
+            residual = self._at(z).residual
+            square = float(np.sum(residual**2))
+            if square < least:
+                best, least = z.copy(), square
+            elif square != least:
+                worse += 1
+            if worse > WORSE_MAX:
+                raise _JumpsError
+            return residual
 
         def stop(z: Floats) -> None:
             if is_over(z):
                 raise StopIteration
 
-        return least_squares(
-            self._residual,
-            z,
-            jac=self._by_transformed,
-            bounds=(self._transformed(self._low), self._transformed(self._high)),
-            x_scale="jac",
-            xtol=TOLERANCE,
-            ftol=TOLERANCE,
-            max_nfev=runs,
-            callback=stop,
-        )
+        try:
+            solution: Any = least_squares(
+                residual,
+                begin,
+                jac=self._by_transformed,
+                bounds=(self._transformed(self._low), self._transformed(self._high)),
+                x_scale="jac",
+                xtol=TOLERANCE,
+                ftol=TOLERANCE,
+                max_nfev=runs,
+                callback=stop,
+            )
+        except _JumpsError:
+            return best, f"{worse} runs were worse than the linear model of the residual"
+        return best, str(solution.message)
 
     def _is_near(self, z: Floats) -> bool:
         """Return whether the minimum of the linear model is within `NEAR` standard deviations."""
@@ -440,9 +479,6 @@ class _Search:
         J = run.jacobian[:, is_free]
         return float(down[is_free] @ np.linalg.pinv(J.T @ J) @ down[is_free])
 
-    def _residual(self, z: Floats) -> Floats:
-        return self._at(z).residual
-
     def _by_transformed(self, z: Floats) -> Floats:
         values = self._values(z)
         rate = np.where(self._is_log, list(values.values()), 1.0)
@@ -468,11 +504,15 @@ class _Search:
         return self._run(self._values(z))
 
     def _run(self, values: Mapping[str, float]) -> _Run:
-        steps = () if self._step_ends is None else tuple(self._step_ends)
-        key = (tuple(values.values()), steps)
+        key = self._key(values)
         if key not in self._runs:
             self._runs[key] = self._simulated(values)
+            self._count_of_runs += 1
         return self._runs[key]
+
+    def _key(self, values: Mapping[str, float]) -> _Key:
+        steps = () if self._step_ends is None else tuple(self._step_ends.tolist())
+        return tuple(values.values()), steps
 
     def _simulated(self, values: Mapping[str, float]) -> _Run:
         scene = self._scenes.with_values(values).differentiated(self._names)
