@@ -148,26 +148,26 @@ def test_a_search_does_not_follow_jumps_within_the_noise(
 def test_runs_near_the_minimum_repeat_the_steps_of_one_run(
     scenes: SceneFamily, run: ClothRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    given: list[Floats | None] = []
-    taken: list[Floats] = []
+    repeated: list[Floats | None] = []
+    chosen: list[Floats] = []
     simulate = Scene.run
 
     def recorded(scene: Scene) -> ClothRun:
         result = simulate(scene)
-        given.append(scene.step_ends)
-        taken.append(result.step_ends)
+        repeated.append(scene.step_ends)
+        chosen.append(result.step_ends)
         return result
 
     monkeypatch.setattr(Scene, "run", recorded)
     # A low start is far enough for runs with free steps before the others.
     answer = fit(scenes, [vertices(run)], ["mu"], start={"mu": 0.05})
     # The last run has finer steps of its own.
-    assert answer.runs == len(given) - 1
-    assert given[0] is None
-    assert given[-1] is None
-    begin = next(number for number, steps in enumerate(given) if steps is not None)
-    assert all(steps is not None for steps in given[begin:-1])
-    assert all(np.array_equal(steps, taken[begin - 1]) for steps in taken[begin:-1])
+    assert answer.runs == len(repeated) - 1
+    assert repeated[0] is None
+    assert repeated[-1] is None
+    begin = next(number for number, steps in enumerate(repeated) if steps is not None)
+    assert all(steps is not None for steps in repeated[begin:-1])
+    assert all(np.array_equal(steps, chosen[begin - 1]) for steps in chosen[begin:-1])
 
 
 def test_a_fit_that_leaves_a_residual_says_so(scenes: SceneFamily, run: ClothRun) -> None:

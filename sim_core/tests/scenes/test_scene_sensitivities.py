@@ -58,9 +58,24 @@ def test_hung_start_is_differentiated(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["mu", "bending", "speed"])
 def test_drag_is_differentiated(name: str) -> None:
-    # It has come to the floor, and is dragged.
-    family = with_fixed_steps(drag(frames=31), 0.02)
-    assert relative_error(family, name, 1e-6, slice(24, None)) < 1e-3
+    # It comes to the floor, and is dragged. A contact may change its branch within the difference
+    # in some frames.
+    free = drag(frames=31)
+    steps = free.scene().run().step_ends
+
+    def with_steps(values: Mapping[str, float], hang: Any) -> Scene:
+        scene = free.make(values, hang)
+        return replace(scene, preset=replace(scene.preset, tolerance=1e-8), step_ends=steps)
+
+    family = replace(free, make=with_steps)
+    by = family.differentiated([name]).run().sensitivities[name].positions[1:]
+    value, h = family.parameters[name].value, 1e-5
+    high, low = (family.scene(**{name: value + step}).run().positions[1:] for step in (h, -h))
+    errors = np.linalg.norm((high - low) / (2.0 * h) - by, axis=(1, 2))
+    sizes = np.linalg.norm(by, axis=(1, 2))
+    depends = sizes > 1e-6
+    assert depends.sum() > 20
+    assert np.median(errors[depends] / sizes[depends]) < 2e-5
 
 
 def test_positions_do_not_change() -> None:
