@@ -52,3 +52,15 @@ def matrices_of_vectors(vectors: Floats) -> Floats:
     with np.errstate(divide="ignore", invalid="ignore"):
         scale = np.where(angle <= SMALL, series, np.sin(0.5 * angle) / angle)
     return matrices_of_quaternions(np.column_stack([np.cos(0.5 * angle), scale[:, None] * vectors]))
+
+
+def vectors_of_matrices(matrices: Floats) -> Floats:
+    """Return the rotation vectors (n, 3) of rotations (n, 3, 3), up to half a turn [rad]."""
+    quaternions = quaternions_of_matrices(matrices)
+    # A quaternion and its negative are the same rotation, once the short and once the long way.
+    w = np.abs(quaternions[:, 0])
+    v = np.where(quaternions[:, :1] < 0.0, -1.0, 1.0) * quaternions[:, 1:]
+    sine = np.sqrt((v**2).sum(axis=1))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = np.where(sine > 0.0, 2.0 * np.arctan2(sine, w) / sine, 2.0)
+    return np.asarray(scale[:, None] * v)

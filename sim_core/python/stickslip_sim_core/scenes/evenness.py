@@ -13,6 +13,7 @@ from stickslip_sim_core._sim_core import body_gaps
 from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth.contact import Body
 from stickslip_sim_core.cloth.solver import Cloth, Motion
+from stickslip_sim_core.rotations import matrices_of_vectors, vectors_of_matrices
 
 LOOKS = 8
 """Number of instants at which the motion is looked at.
@@ -31,19 +32,45 @@ def uneven_until(end: float, cloth: Cloth, motion: Motion) -> float | None:
     if not begin < end < cloth.time:
         return None
     shares = np.arange(LOOKS + 1) / LOOKS
-    paths = []
-    touched = _touched(cloth, motion(end)[2])
+    points, bodies = [], []
     for share in shares:
         time = begin + share * (end - begin)
-        _, held, bodies = motion(time)
-        points = [np.reshape(np.asarray(held, float), (-1, 3))]
-        points += [surface.at(time) for surface in cloth.surfaces]
-        for body, local in zip(bodies, touched, strict=True):
-            points.append(local @ np.asarray(body.rotation).T + np.asarray(body.origin))
-        paths.append(np.concatenate(points))
-    path = np.stack(paths)
+        _, held, now = motion(time)
+        at = [np.reshape(np.asarray(held, float), (-1, 3))]
+        at += [surface.at(time) for surface in cloth.surfaces]
+        points.append(np.concatenate(at))
+        bodies.append(now)
+    path = np.stack(points)
     even = path[0] + shares[:, None, None] * (path[-1] - path[0])
-    return float(np.linalg.norm(path - even, axis=2).max(initial=0.0))
+    distances = [np.linalg.norm(path - even, axis=2).max(initial=0.0)]
+    touched = _touched(cloth, bodies[-1])
+    for number, local in enumerate(touched):
+        poses = [_pose(at_one_time[number]) for at_one_time in bodies]
+        distances.append(_uneven_body(poses, shares, local))
+    return float(max(distances))
+
+
+def _pose(body: Body) -> tuple[Floats, Floats]:
+    return np.asarray(body.rotation, float), np.asarray(body.origin, float)
+
+
+def _uneven_body(poses: Sequence[tuple[Floats, Floats]], shares: Floats, local: Floats) -> float:
+    """Return the largest distance of points of a body (N, 3) from an even motion [m].
+
+    Like the solver, it takes a body to move evenly if its origin is on a straight line and its turn
+    is even. A point of an even turn goes on an arc.
+    """
+    (rotation_begin, origin_begin), (rotation_end, origin_end) = poses[0], poses[-1]
+    (turn,) = vectors_of_matrices((rotation_end @ rotation_begin.T)[None])
+    largest = 0.0
+    for share, (rotation, origin), part in zip(
+        shares, poses, matrices_of_vectors(shares[:, None] * turn), strict=True
+    ):
+        even_origin = origin_begin + share * (origin_end - origin_begin)
+        change = rotation - part @ rotation_begin
+        distances = np.linalg.norm(local @ change.T + origin - even_origin, axis=1)
+        largest = max(largest, float(distances.max(initial=0.0)))
+    return largest
 
 
 def _touched(cloth: Cloth, bodies: Sequence[Body]) -> list[Floats]:
