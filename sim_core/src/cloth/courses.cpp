@@ -9,7 +9,7 @@ Courses Stepper::courses() const {
   const Numbering& numbering = assembly_.numbering;
   Courses out{std::vector<Course>(numbering.nodes, Course::bound),
               Buffer<double>(4L * numbering.nodes, 0.0), Buffer<double>(4L * numbering.nodes, 0.0),
-              std::vector<char>(numbering.nodes, 0)};
+              std::vector<char>(numbering.nodes, 0), std::vector<char>(numbering.nodes, 0)};
   for (int i = 0; i < numbering.free_nodes; ++i) {
     if (newton.contact.mode[i] == contact_open) out.of_node[i] = Course::free;
     if (newton.contact.mode[i] == contact_stick) at_node(out.gain, i) = turns_.gain(i);
@@ -17,6 +17,10 @@ Courses Stepper::courses() const {
     out.of_node[i] = Course::sliding;
     at_node(out.support, i) = turns_.support(i);
     out.outrun[i] = turns_.outruns(i);
+  }
+  for (int i = 0; i < numbering.free_nodes; ++i) {
+    out.followed[i] = turns_.followed(i).applies;
+    if (out.followed[i]) at_node(out.gain, i) = turns_.followed(i).gain;
   }
   if (!newton.pairs) return out;
   for (const Pair& pair : newton.pairs->list()) {
@@ -30,6 +34,11 @@ Courses Stepper::courses() const {
     out.pushes_itself = out.pushes_itself || is_cloth;
   }
   return out;
+}
+
+double Stepper::turn_error(double dt, const BoundaryConditions& drive, double lasts) {
+  const StepProblem problem{dt, drive.damping, start_, inertia_, bodies_before_, drive.bodies};
+  return turns_.error(solved(problem), lasts);
 }
 
 // How far bodies and surfaces push out what begins a step inside them, or nearer than it may be, m.

@@ -2,15 +2,13 @@
 
 #include <algorithm>
 
+#include "cloth/constants.hpp"
+
 namespace sim_core {
 
 using Eigen::Vector3d;
 
 namespace {
-
-// Rate at which a support gains speed, m/s^2, up to which it is taken to move evenly: a hundredth
-// of g, which friction follows at any coefficient that matters.
-constexpr double even_gain = 0.1;
 
 // How far what a node touches carries the place where it began the step, m.
 Vector3d carried_by(int node, const SolvedStep& step) {
@@ -52,7 +50,7 @@ FrictionTurns::Rubbing FrictionTurns::rubbing(int node, const SolvedStep& step) 
   const Rubbing& last = last_[node];
   if (!last.touches) return out;
   const Vector3d change = out.support - last.support;
-  out.is_even = !(change.norm() > even_gain * between(step));
+  out.is_even = !(change.norm() > shaken::even_gain * between(step));
   if (out.is_even) return out;
   out.gain = change / between(step);
   // What slides has all the friction there is.
@@ -64,13 +62,25 @@ FrictionTurns::Rubbing FrictionTurns::rubbing(int node, const SolvedStep& step) 
   return out;
 }
 
-double FrictionTurns::error(const SolvedStep& step) const {
+void FrictionTurns::follow(const SolvedStep& step) {
+  for (std::size_t i = 0; i < last_.size(); ++i) {
+    const bool follows = !step.path.empty() && last_[i].touches;
+    followed_[i] = follows ? follow_slip(static_cast<int>(i), step) : FollowedSlip{};
+  }
+}
+
+double FrictionTurns::error(const SolvedStep& step, double lasts) const {
   double largest = 0.0;
+  for (const FollowedSlip& end : followed_) {
+    largest = std::max({largest, shaken::turns_that_add_up * end.misplaced,
+                        shaken::lasting * lasts * end.uncertain});
+  }
+  if (!step.path.empty()) return largest;
   for (int i = 0; i < static_cast<int>(last_.size()); ++i) {
     const Rubbing now = rubbing(i, step);
     if (!now.outruns) continue;
     const double change = now.normal * (now.friction - last_[i].friction).norm();
-    largest = std::max(largest, 0.5 * step.problem.dt * change);
+    largest = std::max(largest, 0.5 * step.problem.dt * change * lasts);
   }
   return largest;
 }
@@ -90,9 +100,10 @@ Vector3d FrictionTurns::missing(int node, const Rubbing& now, const SolvedStep& 
 
 void FrictionTurns::store(const SolvedStep& step) {
   std::vector<Rubbing> next(last_.size());
+  if (step.path.empty()) std::fill(followed_.begin(), followed_.end(), FollowedSlip{});
   for (int i = 0; i < static_cast<int>(last_.size()); ++i) {
     next[i] = rubbing(i, step);
-    correction_[i] = missing(i, next[i], step);
+    correction_[i] = step.path.empty() ? missing(i, next[i], step) : Vector3d::Zero();
     if (correction_[i].isZero(0.0)) continue;
     // It slides on, in the other direction.
     next[i].slides = true;

@@ -10,46 +10,51 @@
 // with the friction f, over the normal force N, of the step before. Friction has acted along f
 // until t*, and along -f since. The velocity is corrected by the difference of that to the friction
 // of the step, and steps are halved until the difference is small.
+//
+// Where the controller knows the way of the support within the step, none of this applies: the slip
+// of each node is followed through it (followed_slip.hpp).
 #pragma once
 
 #include <Eigen/Core>
 #include <vector>
 
-#include "cloth/newton.hpp"
-#include "cloth/velocities.hpp"
+#include "cloth/followed_slip.hpp"
 
 namespace sim_core {
-
-// A step that was solved to x, and what it went on from.
-struct SolvedStep {
-  const StepProblem& problem;
-  const Buffer<double>& x;
-  const Newton& newton;
-  const Velocities& velocities;
-  const Buffer<double>& mass;  // (nodes), kg
-};
 
 class FrictionTurns {
  public:
   explicit FrictionTurns(int free_nodes)
-      : last_(free_nodes), correction_(free_nodes, Eigen::Vector3d::Zero()) {}
+      : last_(free_nodes),
+        correction_(free_nodes, Eigen::Vector3d::Zero()),
+        followed_(free_nodes) {}
 
   // A new run begins, without a last step.
   void restart() { last_.assign(last_.size(), {}); }
-  // Largest velocity of a free node that is uncertain by the direction of friction, m/s.
-  double error(const SolvedStep& step) const;
+  // Largest distance by which a free node is misplaced since friction turned, m. A velocity that is
+  // uncertain by its direction counts as the place that it leads to in the time `lasts`, s.
+  double error(const SolvedStep& step, double lasts) const;
+  // Follows the slip of nodes through a step that was solved, if it has a path. Else they follow
+  // nothing.
+  void follow(const SolvedStep& step);
   // The step is taken.
   void store(const SolvedStep& step);
 
-  // Of the last step: what its velocity lacks, m/s; the velocity of what the node touched [m/s], 0
-  // where that moves evenly; and whether it gains speed faster than friction drives the cloth.
-  const Eigen::Vector3d& correction(int node) const { return correction_[node]; }
+  // Of the last step: the velocity of a node with what the solved one lacks, m/s; the velocity of
+  // what the node touched [m/s], 0 where that moves evenly; and whether that gains speed faster
+  // than friction drives the cloth.
+  Eigen::Vector3d corrected(int node, const Eigen::Vector3d& velocity) const {
+    const FollowedSlip& end = followed_[node];
+    if (!end.applies) return velocity + correction_[node];
+    return end.velocity + velocity.dot(end.normal) * end.normal;
+  }
   Eigen::Vector3d support(int node) const {
     return last_[node].is_even ? Eigen::Vector3d::Zero().eval() : last_[node].support;
   }
   // How fast that gains speed, m/s^2.
   const Eigen::Vector3d& gain(int node) const { return last_[node].gain; }
   bool outruns(int node) const { return last_[node].outruns; }
+  const FollowedSlip& followed(int node) const { return followed_[node]; }
 
  private:
   struct Rubbing {
@@ -65,6 +70,7 @@ class FrictionTurns {
 
   std::vector<Rubbing> last_;                // (free nodes)
   std::vector<Eigen::Vector3d> correction_;  // (free nodes)
+  std::vector<FollowedSlip> followed_;       // (free nodes)
   double last_dt_ = 0.0;                     // s
 };
 

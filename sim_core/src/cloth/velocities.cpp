@@ -139,6 +139,12 @@ double Velocities::error_of(int node, const Vector3d& x, Course now, const Inert
 bool Velocities::update_staggered(int node, double dt, double b, const Vector3d& v,
                                   const Courses& courses) {
   at_node(acceleration_, node) = (v - at_node(before_, node)) / b;
+  if (courses.followed[node]) {
+    at_node(continuing_, node) = at_node(courses.gain, node);
+    at_node(at_end, node) = at_node(before_, node) = v;
+    continued_[node] = 0;
+    return true;
+  }
   const Vector3d change = 0.5 * dt / b * (v - at_node(before_, node));
   const bool goes_on = continues(node, courses, v + change, v);
   at_node(continuing_, node) = goes_on ? Vector3d(2.0 / dt * change) : at_node(courses.gain, node);
@@ -179,7 +185,8 @@ void Velocities::update(const Inertia& inertia, const Buffer<double>& x,
   rejuvenates_ = all_continue || !courses.pushes_itself;
   // Cloth that lies still does so until the next step begins, whatever then sets it in motion.
   for (int i = 0; i < static_cast<int>(age_.size()); ++i) {
-    const bool at_instant = lies_still || inertia.scheme[i] == Scheme::second_order;
+    const bool at_instant =
+        lies_still || courses.followed[i] || inertia.scheme[i] == Scheme::second_order;
     age_[i] = at_instant ? 0.0 : 0.5 * dt;
   }
   dt_before_ = dt;

@@ -37,6 +37,8 @@ struct Courses {
   Buffer<double> support;      // (nodes, 4), m/s: of what a node slides on
   Buffer<double> gain;         // (nodes, 4), m/s^2: of the velocity of what a node sticks to
   std::vector<char> outrun;    // (nodes): whether that gains speed faster than friction gives it
+  std::vector<char> followed;  // (nodes): whether the velocity given is that at the end of the
+                               // step, and `gain` its rate
   bool pushes_itself = false;  // whether cloth pushes cloth
 };
 
