@@ -1,5 +1,6 @@
 #include <Eigen/LU>
 #include <algorithm>
+#include <array>
 #include <cmath>
 
 #include "cloth/stepping.hpp"
@@ -11,6 +12,7 @@ using Eigen::Matrix2d;
 using Eigen::Matrix3d;
 using Eigen::Vector2d;
 using Eigen::Vector3d;
+using Eigen::Vector4d;
 
 namespace {
 
@@ -41,6 +43,59 @@ double corrected_error(double lean) {
 
 double angle_between(const Vector3d& a, const Vector3d& b) {
   return std::atan2(a.cross(b).norm(), a.dot(b));
+}
+
+bool is_inside(const Vector4d& weights) { return (weights.tail<3>().array() != 0.0).all(); }
+
+// Smallest angle of a direction with the normals of the triangles that have these nodes, but for
+// one with all of `left_out`, rad.
+double angle_with_triangles(const Surface& surface, const std::vector<int>& nodes,
+                            const std::array<int, 3>& left_out, const Buffer<double>& x,
+                            const Vector3d& direction) {
+  double least = HUGE_VAL;
+  const auto has = [](const std::array<int, 3>& triangle, int node) {
+    return std::find(triangle.begin(), triangle.end(), node) != triangle.end();
+  };
+  for (int k = surface.around_begin[nodes[0]]; k < surface.around_begin[nodes[0] + 1]; ++k) {
+    const std::array<int, 3>& triangle = surface.triangles[surface.around[k]];
+    const auto in_triangle = [&](int node) { return has(triangle, node); };
+    const bool is_left_out = std::all_of(left_out.begin(), left_out.end(), in_triangle);
+    if (is_left_out || !std::all_of(nodes.begin(), nodes.end(), in_triangle)) continue;
+    const Vector3d a = at_node(x, triangle[0]), b = at_node(x, triangle[1]),
+                   c = at_node(x, triangle[2]);
+    const double angle = angle_between((b - a).cross(c - a), direction);
+    least = std::min({least, angle, M_PI - angle});
+  }
+  return least;
+}
+
+// By how much the normal of a pair differs from those of the triangles from which it came, rad:
+// infinite where it came from none. `start`: its weights when the step began.
+//
+// Within a triangle the normal is that of the triangle, and does not turn however far the pair
+// slides. Where the closest point was at a border of it, the pair came from the triangle beyond.
+// The direction to the border then says how far away that is, and not how far the sheet turns.
+double angle_of_arrival(const StepTaken& step, const ContactSet& pairs, const Pair& pair,
+                        const Vector4d& start) {
+  const std::array<int, 4>& node = pair.stencil.node;
+  const Surface& surface = pairs.near.surface;
+  const auto angle_with = [&](const std::vector<int>& nodes, const std::array<int, 3>& left_out) {
+    return angle_with_triangles(surface, nodes, left_out, step.x, pair.contact.normal);
+  };
+  if (pair.stencil.kind == PairKind::vertex_triangle) {
+    if (is_inside(start)) return is_inside(pair.weights) ? 0.0 : HUGE_VAL;
+    std::vector<int> border;
+    for (int c = 1; c < 4; ++c) {
+      if (start[c] != 0.0) border.push_back(node[c]);
+    }
+    return angle_with(border, {node[1], node[2], node[3]});
+  }
+  double least = HUGE_VAL;
+  for (int c = 0; c < 4; ++c) {
+    // The other end of the same edge has no weight.
+    if (start[c ^ 1] == 0.0) least = std::min(least, angle_with({node[c]}, {-1, -1, -1}));
+  }
+  return least;
 }
 
 }  // namespace
@@ -200,9 +255,10 @@ double StepDiagnostics::node_error(const StepTaken& step, const Newton& newton, 
 double StepDiagnostics::pair_error(const StepTaken& step, ContactSet& pairs,
                                    const Pair& pair) const {
   const FourPoints at = points_of(pair.stencil, step.start);
-  const Vector3d before = pairs.turn_of(pair.stencil, pair.weights) *
-                          between_closest(closest_weights(pair.stencil.kind, at), at);
-  const double angle = angle_between(before, pair.contact.normal);
+  const Vector4d start = closest_weights(pair.stencil.kind, at);
+  const Vector3d before = pairs.turn_of(pair.stencil, pair.weights) * between_closest(start, at);
+  const double angle = std::min(angle_between(before, pair.contact.normal),
+                                angle_of_arrival(step, pairs, pair, start));
   double cell = 0.0;
   for (int node : pair.stencil.node) {
     const int vertex = assembly_.numbering.vertex[node];
