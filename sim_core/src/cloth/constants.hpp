@@ -132,8 +132,8 @@ constexpr int samples = 64;
 }  // namespace control
 
 // Supports that gain speed faster than friction gives it to cloth, followed_slip.cpp,
-// friction_turns.cpp and control.cpp. The numbers were chosen on 85 runs of a patch on floors of 12
-// to 70 Hz, 0.5 to 4 mm and mu 0.2 to 1.2.
+// friction_turns.cpp and control.cpp. The numbers were chosen on some hundred runs of a patch on
+// floors of 12 to 70 Hz, 0.5 to 4 mm and mu 0.2 to 1.2, and judged on 120 others: docs/cloth.md.
 namespace shaken {
 
 // Rate at which a support gains speed, m/s^2, up to which it is taken to move evenly: a hundredth
@@ -144,11 +144,11 @@ constexpr int parts = 16;
 // Rate at which a support gains speed, over the most that friction gives to cloth, from which slip
 // is followed. Below, what sticks keeps sticking, and what slides does not turn.
 constexpr double followed_from = 0.5;
-// Errors of place that add up, over the turns of a support: with 10 in place of 30 a patch is twice
-// as far off, and takes 7 % fewer steps.
+// Errors of place that add up, over the turns of a support in a second: a floor of 15 Hz turns as
+// often. With 10, patches were clearly further off.
 constexpr double turns_that_add_up = 30.0;
 // Longest steps for which cloth keeps the velocity at which its support set it off: half a second
-// with `certified`. With 1 a patch is off by up to 6 % of its way, with 4 by 3 %.
+// with `certified`. With 1, patches were further off.
 constexpr double lasting = 4.0;
 // Change of a support's acceleration from one part to the next, over the larger, from which it is
 // set off between them: a 70 Hz sine stays far below it where it is fast.
