@@ -38,8 +38,8 @@ setup-dev: setup .venv/dev.stamp
 	@$(PYTHON) tools/setup_environment.py development
 	@touch $@
 
-# The editable install builds the C++ core once: a changed source builds it again. nanobind and Eigen stand in .venv before:
-# a wheel finds them at the same places, and reuses what has been compiled.
+# The editable install builds the C++ core once: a changed source builds it again. A wheel compiles everything anew, and so
+# does the next editable install after it: scikit-build-core clears a build folder for each new environment of a build.
 .venv/core.stamp: $(CORE_SOURCES) | .venv/setup.stamp
 	@if [ -n "$$(find $(CORE_SOURCES) -newer $@ 2>&1)" ]; then \
 	  echo "building sim_core (1 to 3 minutes)"; \
