@@ -239,7 +239,7 @@ def growing(first: float, growth: float, longest: float, settled: int, count: in
     steps = [first] * settled
     while len(steps) < count:
         steps.append(min(growth * steps[-1], longest))
-    return np.cumsum(steps).tolist()
+    return [float(end) for end in np.cumsum(steps)]
 
 
 MU = SceneParameter(0.3, 0.0, 2.0)
