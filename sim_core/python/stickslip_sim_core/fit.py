@@ -449,7 +449,7 @@ class _Search:
                 callback=stop,
             )
         except _JumpsError:
-            return best, f"{worse} runs were worse than the linear model of the residual"
+            return best, f"{worse} runs were worse than the best before, since the residual jumps"
         return best, str(solution.message)
 
     def _is_near(self, z: Floats) -> bool:
