@@ -418,17 +418,20 @@ class _Search:
         """Return the best point of a search by least squares, and why it ended."""
         from scipy.optimize import least_squares
 
-        best, least, worse = begin, np.inf, 0
+        best = begin
+        least_square = np.inf
+        worse_runs = 0
 
         def residual(z: Floats) -> Floats:
-            nonlocal best, least, worse
+            nonlocal best, least_square, worse_runs
             residual = self._at(z).residual
             square = float(np.sum(residual**2))
-            if square < least:
-                best, least = z.copy(), square
-            elif square != least:
-                worse += 1
-            if worse > WORSE_MAX:
+            if square < least_square:
+                best = z.copy()
+                least_square = square
+            elif square != least_square:
+                worse_runs += 1
+            if worse_runs > WORSE_MAX:
                 raise _JumpsError
             return residual
 
@@ -449,7 +452,10 @@ class _Search:
                 callback=stop,
             )
         except _JumpsError:
-            return best, f"{worse} runs were worse than the best before, since the residual jumps"
+            return (
+                best,
+                f"{worse_runs} runs were worse than the best before, since the residual jumps",
+            )
         return best, str(solution.message)
 
     def _is_near(self, z: Floats) -> bool:

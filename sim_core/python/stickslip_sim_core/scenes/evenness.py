@@ -32,7 +32,8 @@ def uneven_until(end: float, cloth: Cloth, motion: Motion) -> float | None:
     if not begin < end < cloth.time:
         return None
     shares = np.arange(LOOKS + 1) / LOOKS
-    points, bodies = [], []
+    points = []
+    bodies = []
     for share in shares:
         time = begin + share * (end - begin)
         _, held, now = motion(time)
