@@ -180,7 +180,7 @@ def test_from_a_users_scene_to_a_training_batch(service: Service, tmp_path: Path
     assert known["cached_count"] == 16  # simulations and renders of two frictions
     # One vertex of the block elsewhere: all runs, on both nodes together.
     wait_for("both nodes", lambda: ready(service) == 2 or None, 60)
-    moved = run_job(service, spec(upload(service, 0.0199)), busy)
+    moved = run_job(service, spec(upload(service, 0.0195)), busy)
     assert job_run(moved) == job_run(job)
     assert moved["dataset"]["dataset"] != version
     assert len(busy) == 2

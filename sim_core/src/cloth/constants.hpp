@@ -29,9 +29,9 @@ constexpr int cuts_max = 4;
 // Length of the first smoothing over h, and of each smoothing over the one before: each is much
 // sharper. Sweep: 0.05 and 0.2 take 21 and 20 % more in a crumple.
 constexpr double smoothing_ratio = 1.0 / much;
-// Residual, over the mean force of smoothing, from which the law becomes sharper. Sweep: 2.5 and 10
-// take 9 and 19 % more in a crumple.
-constexpr double smoothed_residual = 5.0;
+// Residual, over the mean force of smoothing, from which the law becomes sharper: it is not much
+// larger yet. Sweep: 2.5 and 10 take 9 and 19 % more in a crumple.
+constexpr double smoothed_residual = 0.5 * much;
 // Relative tolerance of GMRES under the smoothed law, whose matrix is the worse conditioned the
 // stiffer its proximal terms are. Sweep: 5e-7 and 2e-6 take 7 and 19 % more in a crumple.
 constexpr double smoothed_tolerance =
@@ -48,8 +48,8 @@ constexpr double slow = pairs::converging * pairs::converging;
 // in a crumple.
 constexpr double close = 1.0 / (much * much * much * much);
 // Share to which all nodes are shortened together before single ones are stopped, which strains the
-// cloth. Sweep: 0.05 and 0.2 take 20 and 8 % more in a crumple.
-constexpr double common_min = 0.1;
+// cloth: all go much less far. Sweep: 0.05 and 0.2 take 20 and 8 % more in a crumple.
+constexpr double common_min = 1.0 / much;
 
 }  // namespace newton
 
@@ -113,9 +113,10 @@ constexpr double forgiven = 0.02;
 // Weight of the last step in the mean cost of its level: that of three steps. Sweep: within 6 %.
 constexpr double novelty = 0.3;
 // Velocity by which friction that turns may be wrong, times the longest step, over the allowed
-// error, from which a step is taken back. It adds up over the turns of a body that shakes: at 2.0 a
-// patch on a floor that is shaken at 24 to 60 Hz is 1.1 times as far off.
-constexpr double turned_at = 0.5;
+// error, from which a step is taken back: a quarter of what one error may be, because it adds up
+// over the turns of a body that shakes. At 2.0 a patch on a floor that is shaken at 24 to 60 Hz is
+// 1.1 times as far off.
+constexpr double turned_at = reject_at / 4.0;
 // Halvings of a step that is not solved beyond `finest`. Without any, royal-target dragged for 24 s
 // at mu 0.8 cost 24.8 CPU s in place of 14.5. Sweep: 2 takes 1 % more iterations and 3 % more
 // factors of a fold that is let down.
@@ -139,8 +140,9 @@ namespace shaken {
 // Rate at which a support gains speed, m/s^2, up to which it is taken to move evenly: a hundredth
 // of g, which friction follows at any coefficient that matters.
 constexpr double even_gain = 0.1;
-// Equal parts of a step in which the velocity of a support is looked at.
-constexpr int parts = 16;
+// Equal parts of a step in which the velocity of a support is looked at: in the longest step, each
+// has four samples.
+constexpr int parts = control::samples / 4;
 // Rate at which a support gains speed, over the most that friction gives to cloth, from which slip
 // is followed. Below, what sticks keeps sticking, and what slides does not turn.
 constexpr double followed_from = 0.5;
@@ -151,10 +153,8 @@ constexpr double turns_that_add_up = 30.0;
 // with `certified`. With 1, patches were further off.
 constexpr double lasting = 4.0;
 // Change of a support's acceleration from one part to the next, over the larger, from which it is
-// set off between them: a 70 Hz sine stays far below it where it is fast.
-constexpr double set_off = 0.5;
-// Speed of slip up to which cloth sticks, m/s: a nanometre in a millisecond.
-constexpr double still_speed = 1e-6;
+// set off between them: the same share. A 70 Hz sine stays far below it where it is fast.
+constexpr double set_off = followed_from;
 
 }  // namespace shaken
 

@@ -12,6 +12,9 @@ using Eigen::Vector3d;
 
 namespace {
 
+// Slip that only rounding leaves, m/s: a nanometre in a millisecond.
+constexpr double still_speed = 1e-6;
+
 // How far what a node touches has carried the place where it began the step, at each time of the
 // path, in the plane of contact, m.
 std::vector<Vector3d> ways_of_support(int node, const BodyContact& on, const Vector3d& n,
@@ -85,7 +88,7 @@ Vector3d after_part(const Part& part, Vector3d v) {
   const Vector3d gain = (part.ends - part.begins) / part.length, slip = v - part.begins;
   double left = part.length;
   // Friction that turns within the part turns where the slip is zero.
-  if (slip.norm() > shaken::still_speed) {
+  if (slip.norm() > still_speed) {
     const Vector3d friction = -part.most * slip.normalized();
     const double slowing = -(part.other + friction - gain).dot(slip.normalized());
     const double until = slowing > 0.0 ? slip.norm() / slowing : HUGE_VAL;
