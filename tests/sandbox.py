@@ -52,9 +52,10 @@ if [ ! -e "$root$REPOSITORY/Makefile" ]; then
   mount --bind "$REPOSITORY" "$root$REPOSITORY"
 fi
 mount --bind "$root$REPOSITORY" "$root/opt/stickslip"
-# Other users run this interpreter, too, which may be in somebody's home.
-above=$INTERPRETER
-while [ "$above" != / ]; do above=$(dirname "$above"); chmod a+rx "$root$above"; done
+# Other users run this interpreter and the repository, too, which may be in somebody's home.
+for above in "$INTERPRETER" "$REPOSITORY"; do
+  while [ "$above" != / ]; do above=$(dirname "$above"); chmod a+rx "$root$above"; done
+done
 cp -a "$STAND_INS"/. "$root/stand-ins"
 ip link set lo up
 hostname node1

@@ -22,7 +22,7 @@ from stickslip_schemas.kinds.rod_hang import RodHangRender
 from stickslip_schemas.store import CorruptArtifactError
 from stickslip_workers.batching import merge_renders, shading_key, split_render_result
 from stickslip_workers.dispatcher import process_failure
-from stickslip_workers.process_log import TAIL_LINES, ProcessLog
+from stickslip_workers.process_log import TAIL_LETTERS, TAIL_LINES, ProcessLog
 from stickslip_workers.stages.run import MESSAGE_LENGTH, failure
 
 RECORD = RecordRef(digest="d" * 64, row=0)
@@ -93,6 +93,21 @@ def test_a_message_has_what_a_dead_process_wrote_for_this_call(tmp_path: Path) -
     # The process of another machine has no file here.
     elsewhere = ProcessLog(str(tmp_path / "elsewhere.err"), 0)
     assert process_failure(died, renders=False, log=elsewhere).message == str(died)
+
+
+def test_a_message_names_the_signal_of_a_long_traceback(tmp_path: Path) -> None:
+    path = tmp_path / "worker.err"
+    frame = f'  File "/{"deep/" * 40}call.py", line 62 in work\n'
+    signal = "Fatal Python error: Segmentation fault"
+    modules = "Extension modules: " + "numpy, " * 500
+    path.write_text(f"{signal}\n\nCurrent thread (most recent call first):\n{frame * 12}{modules}")
+    message = process_failure(
+        ray_errors.WorkerCrashedError(), renders=True, log=ProcessLog(str(path), 0)
+    ).message
+    lines = message.partition("The end of its log:\n")[2].splitlines()
+    assert lines[0] == signal
+    assert lines[-1] == frame.rstrip()
+    assert len("\n".join(lines)) <= TAIL_LETTERS
 
 
 def done(number: int) -> TaskResult:

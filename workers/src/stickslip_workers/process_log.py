@@ -12,6 +12,12 @@ TAIL_LINES = 20
 TAIL_LETTERS = 1200
 """Most letters of a log in a message, so that the coordinator keeps all of it."""
 
+FATAL = "Fatal Python error: "
+"""Begins the line with which `faulthandler` names the signal that ended a process."""
+
+NOISE = "Extension modules: "
+"""Begins the line in which `faulthandler` lists all compiled modules: over 1,000 letters."""
+
 
 @dataclass(frozen=True, slots=True)
 class ProcessLog:
@@ -25,7 +31,8 @@ class ProcessLog:
     def tail(self) -> str:
         """Return the last lines of the call; empty if there are none.
 
-        A log of another machine is not read: its path does not exist here.
+        The line that names a fatal signal comes first, however long the traceback below it is. A
+        log of another machine is not read: its path does not exist here.
         """
         try:
             with Path(self.path).open("rb") as file:
@@ -34,5 +41,9 @@ class ProcessLog:
                 text = file.read().decode("utf-8", errors="replace")
         except OSError:
             return ""
-        lines = [line for line in text.splitlines() if line.strip()]
-        return "\n".join(lines[-TAIL_LINES:])[-TAIL_LETTERS:]
+        lines = [line for line in text.splitlines() if line.strip() and not line.startswith(NOISE)]
+        tail = "\n".join(lines[-TAIL_LINES:])[-TAIL_LETTERS:]
+        fatal = next((line for line in reversed(lines) if line.startswith(FATAL)), "")
+        if not fatal or fatal in tail:
+            return tail
+        return f"{fatal}\n{tail[len(fatal) + 1 :]}"
