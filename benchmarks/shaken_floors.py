@@ -1,6 +1,7 @@
 """Patches of cloth on floors that are shaken, against a rigid block: how wrong valid runs are.
 
     python benchmarks/shaken_floors.py [--preset certified] [--floors 120] [--draw 1]
+        [--frequencies 33 60]
 
 A floor rests, and then shakes as size (1 - cos(2 pi f t)). Frequency, size, friction and the
 instant at which it begins are drawn at random, and `--draw` numbers the drawing: settings of the
@@ -54,12 +55,20 @@ class Floor:
         return self.size * (1.0 - math.cos(phase))
 
 
-def drawn(number: int, draw: int) -> list[Floor]:
-    """Return floors whose numbers are drawn evenly."""
+def drawn(number: int, draw: int, frequencies: Sequence[float]) -> list[Floor]:
+    """Return floors whose numbers are drawn evenly, frequency and size by their logarithms.
+
+    The frequencies are the given ones in turn, if there are any.
+    """
     rng = np.random.default_rng(draw)
-    low = (12.0, 0.5e-3, 0.2, 0.4)
-    high = (70.0, 4.0e-3, 1.2, 0.8)
-    return [Floor(*map(float, row)) for row in rng.uniform(low, high, (number, 4))]
+    frequency = np.exp(rng.uniform(np.log(12.0), np.log(70.0), number))
+    if frequencies:
+        frequency = np.resize(frequencies, number)
+    size = np.exp(rng.uniform(np.log(0.5e-3), np.log(4.0e-3), number))
+    mu = rng.uniform(0.2, 1.2, number)
+    rest = rng.uniform(0.4, 0.8, number)
+    rows = np.stack([frequency, size, mu, rest], axis=1)
+    return [Floor(*map(float, row)) for row in rows]
 
 
 def patch_on(floor: Floor, preset: str) -> Scene:
@@ -97,9 +106,10 @@ def main() -> None:
     parser.add_argument("--preset", default="certified", choices=sorted(PRESETS))
     parser.add_argument("--floors", type=int, default=120)
     parser.add_argument("--draw", type=int, default=1)
+    parser.add_argument("--frequencies", type=float, nargs="+", default=(), help="[1/s]")
     options = parser.parse_args()
     valid_errors = []
-    for floor in drawn(options.floors, options.draw):
+    for floor in drawn(options.floors, options.draw, options.frequencies):
         run = patch_on(floor, options.preset).run()
         if not run.valid:
             continue
