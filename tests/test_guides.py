@@ -62,6 +62,7 @@ systemctl stop stickslip-worker
 
 
 @pytest.mark.real
+@pytest.mark.slow
 @pytest.mark.timeout(1200)
 def test_the_guide_of_a_ray_cluster_runs(sandbox: Path) -> None:
     """A head, a node and a dispatcher with a token, on one machine with the address of the guide.
@@ -97,6 +98,7 @@ stickslip verify /home/me/my-rods
 
 
 @pytest.mark.real
+@pytest.mark.slow
 @pytest.mark.timeout(1200)
 def test_the_guide_of_containers_runs_without_docker(sandbox: Path) -> None:
     """Each service starts as compose.yaml and its Dockerfile say, is healthy, and makes a dataset.

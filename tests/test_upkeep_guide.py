@@ -42,6 +42,7 @@ def run(code: str, data: Path, backup: Path) -> str:
 
 
 @pytest.mark.real
+@pytest.mark.slow
 @pytest.mark.timeout(1200)
 def test_a_service_is_lost_and_restored(tmp_path: Path, request: pytest.FixtureRequest) -> None:
     """The machine dies in the middle of a job; the service that is restored ends the job."""

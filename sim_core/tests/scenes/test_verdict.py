@@ -143,6 +143,7 @@ def crushed() -> Scene:
     )
 
 
+@pytest.mark.slow
 def test_a_step_without_a_solution_ends_the_run() -> None:
     run = crushed().run()
     assert not run.valid
