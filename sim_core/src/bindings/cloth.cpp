@@ -141,10 +141,9 @@ void bind_cloth(nb::module_& m) {
             return out;
           },
           "How often each rung of the fallback ladder was tried and how often it converged, by "
-          "name, "
-          "in the order: attempt, plain, stiff_pairs, smoothed_law, persistent, best_iterate. A "
-          "rung "
-          "that converged solved the step, or a part of it. See cloth/stepping.hpp.")
+          "name. The solver tries them in the order: attempt, plain, stiff_pairs, smoothed_law, "
+          "persistent, best_iterate. A rung that converged solved the step, or a part of it. See "
+          "cloth/stepping.hpp.")
       .def_ro("seen", &StepReport::extremes)
       .def_ro("motion_error", &StepReport::motion_error,
               "Distance of what drives the cloth from an even motion within a step of the "

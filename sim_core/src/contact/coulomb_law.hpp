@@ -32,12 +32,13 @@
 //     slip     1    0      mu (r_N + q)/|z_T|    mu
 //
 // The smoothed law has values between these. From here mu, the coefficient of friction, enters the
-// matrix by two ways, both in linearized_contact.hpp: c couples friction to the normal force
+// matrix by two ways, both in linearized_contact.cpp: c couples friction to the normal force
 // (`NodeRow::coupling`, `PairRow::stiffness` and `PairRow::force_by_normal`), and b_s is a
-// stiffness against a turn of friction (`NodeRow::turn_stiffness`). The product of the matrix with
-// a vector has both (`apply_contact` and `add_pairs` in cloth/kernels/krylov.hpp). Only the second
-// is symmetric, so it also enters what is factorised: `ContactState::factor_block` in state.cpp for
-// nodes, `PairRow::symmetric` in cloth/pair_factor.cpp for pairs.
+// stiffness against a turn of friction (`NodeRow::turn_stiffness` and `PairRow::symmetric`). The
+// product of the matrix with a vector has both (`apply_contact` and `add_pairs` in
+// cloth/kernels/krylov.hpp). Only the second is symmetric, so it also enters what is factorised:
+// `ContactState::factor_block` in state.cpp for nodes, `PairRow::symmetric` in
+// cloth/pair_factor.cpp for pairs.
 #pragma once
 
 #include <Eigen/Core>

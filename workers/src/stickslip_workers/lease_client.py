@@ -131,6 +131,9 @@ class CoordinatorClient:
     def lease(self, request: api.LeaseRequest) -> api.LeaseBatch:
         """Lease tasks.
 
+        A request whose answer is lost is not repeated: the coordinator takes its tasks back when
+        their lease is over.
+
         Raises CoordinatorError.
         """
         return self._post("/v1/worker/lease", request, api.LeaseBatch, timeout=LONG_TIMEOUT)
