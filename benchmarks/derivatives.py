@@ -1,6 +1,7 @@
 """Derivatives of runs of cloth against central differences of runs with the same steps.
 
     python benchmarks/derivatives.py [CASE ...] [--changes 1e-4 1e-5] [--out RECORD]
+    python benchmarks/derivatives.py --cost MESH
 
 Each case is a scene and a parameter p. A first run chooses the ends of all steps, and further runs
 at p - h, p and p + h repeat them, with tolerance 1e-8. At each frame the error is that of the
@@ -8,7 +9,8 @@ difference of positions, |difference - derivative| over |derivative|, over all v
 the size of p. A difference is wrong where a contact changes its branch between p - h and p + h, so
 that the median over the frames is quoted, besides the worst frame.
 
-Without CASE all run but those of `SLOW`.
+Without CASE all run but those of `SLOW`. With `--cost`, a whole drag of that mesh runs without
+derivatives, by one parameter and by three, and the CPU times are compared.
 """
 
 import argparse
@@ -362,12 +364,35 @@ def closed_form(case: Case) -> float:
     return float(np.abs(run.derivatives[:, :, 0] / exact[:, None] - 1.0).max())
 
 
+def cost(mesh: int) -> dict[str, Any]:
+    """Return the CPU time of a drag of 131 s [s], and its ratio with one and three parameters."""
+    drags = cloth_drag.family("gray-interlock", 0.4, mesh=mesh)
+
+    def seconds(names: Sequence[str]) -> float:
+        scene = drags.differentiated(names) if names else drags.scene()
+        begin = time.process_time()
+        scene.run()
+        return time.process_time() - begin
+
+    plain = seconds([])
+    return {
+        "mesh": mesh,
+        "cpu_seconds": round(plain, 1),
+        "one_parameter": round(seconds(["mu"]) / plain, 2),
+        "three_parameters": round(seconds(["mu", "bending", "density"]) / plain, 2),
+    }
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("cases", nargs="*", help=", ".join(CASES))
     parser.add_argument("--changes", nargs="+", type=float, default=CHANGES)
+    parser.add_argument("--cost", type=int, metavar="MESH")
     parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
+    if arguments.cost:
+        print(json.dumps(cost(arguments.cost)))
+        return
     names = arguments.cases or [name for name in CASES if name not in SLOW]
     rows = []
     for name in names:
