@@ -132,7 +132,7 @@ Membrane::Membrane(const ClothMesh& mesh, const Numbering& numbering, const Fabr
 void Membrane::set_lagged_stretch(const ClothKernel& kernel, const double* x, double fraction) {
   data_.lag = nullptr;
   if (fraction == 0.0 ||
-      std::none_of(tabulated_.begin(), tabulated_.end(), [](char one) { return one != 0; }))
+      std::none_of(tabulated_.begin(), tabulated_.end(), [](char flag) { return flag != 0; }))
     return;
   lag_.resize(9L * membrane_lanes * data_.groups);
   kernel.membrane_lag(data_, x, fraction, lag_.data());
@@ -239,17 +239,19 @@ void Assembly::set_diagonal(const Inertia& inertia, double damping) {
 
 double Assembly::own_stiffness(int node) const {
   const float* block = &blocks_[12L * membrane_diagonal_[node]];
-  const double own =
+  const double mean_stiffness =
       diagonal_[node] + scalars_[bending_diagonal_[node]] + (block[0] + block[5] + block[10]) / 3.0;
-  return std::max(own, static_cast<double>(diagonal_[node]));
+  return std::max(mean_stiffness, static_cast<double>(diagonal_[node]));
 }
 
 Eigen::Matrix3d Assembly::own_block(int node) const {
   const Eigen::Map<const Eigen::Matrix3f, 0, Eigen::OuterStride<4>> block(
       &blocks_[12L * membrane_diagonal_[node]]);
   const double alike = diagonal_[node] + scalars_[bending_diagonal_[node]];
-  const Eigen::Matrix3d own = alike * Eigen::Matrix3d::Identity() + block.cast<double>();
-  return own + std::max(0.0, diagonal_[node] - own.trace() / 3.0) * Eigen::Matrix3d::Identity();
+  const Eigen::Matrix3d stiffness_block =
+      alike * Eigen::Matrix3d::Identity() + block.cast<double>();
+  return stiffness_block + std::max(0.0, diagonal_[node] - stiffness_block.trace() / 3.0) *
+                               Eigen::Matrix3d::Identity();
 }
 
 ClothMatrix Assembly::neighbour(const Buffer<double>& x, NeighbourNumbers& numbers) {

@@ -129,10 +129,10 @@ std::unique_ptr<SmoothContact> smooth_contact_of(const ClothMesh& mesh, const Nu
   append(surfaces.triangles, surface_nodes, triangles);
   std::vector<double> radius(numbering.free_nodes, 0.0);
   for (Eigen::Index t = 0; t < mesh.triangles.rows(); ++t) {
-    const double own = circle_around(mesh, t);
+    const double circumradius = circle_around(mesh, t);
     for (int c = 0; c < 3; ++c) {
       const int node = numbering.node[mesh.triangles(t, c)];
-      if (node < numbering.free_nodes) radius[node] = std::max(radius[node], own);
+      if (node < numbering.free_nodes) radius[node] = std::max(radius[node], circumradius);
     }
   }
   return std::make_unique<SmoothContact>(std::move(triangles),

@@ -262,20 +262,20 @@ Points3 ClothSolver::surface_forces() const {
 
 ClothSolver::PairForces ClothSolver::pair_forces() const {
   const Numbering& numbering = impl_->numbering;
-  std::vector<const Pair*> some;
+  std::vector<const Pair*> acting;
   if (impl_->newton.pairs) {
     for (const Pair& pair : impl_->newton.pairs->list()) {
-      if (!pair.contact.force.isZero(0.0)) some.push_back(&pair);
+      if (!pair.contact.force.isZero(0.0)) acting.push_back(&pair);
     }
   }
-  const auto count = static_cast<Eigen::Index>(some.size());
+  const auto count = static_cast<Eigen::Index>(acting.size());
   PairForces out{{count, 4}, {count, 4}, Points3(count, 3), Eigen::VectorXd(count), Truths(count)};
   for (Eigen::Index p = 0; p < count; ++p) {
-    for (int c = 0; c < 4; ++c) out.vertices(p, c) = numbering.vertex[some[p]->stencil.node[c]];
-    out.weights.row(p) = some[p]->weights.transpose();
-    out.forces.row(p) = some[p]->contact.force.transpose();
-    out.distance[p] = some[p]->contact.gap + some[p]->thickness;
-    out.sliding[p] = some[p]->row.mode == contact_slip;
+    for (int c = 0; c < 4; ++c) out.vertices(p, c) = numbering.vertex[acting[p]->stencil.node[c]];
+    out.weights.row(p) = acting[p]->weights.transpose();
+    out.forces.row(p) = acting[p]->contact.force.transpose();
+    out.distance[p] = acting[p]->contact.gap + acting[p]->thickness;
+    out.sliding[p] = acting[p]->row.mode == contact_slip;
   }
   return out;
 }

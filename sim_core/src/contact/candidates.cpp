@@ -91,14 +91,15 @@ class Around {
     meet_.resize(static_cast<std::size_t>(end - begin));
   }
   // Of those after one: whether they meet it.
-  const std::vector<char>& meeting(int one) {
+  const std::vector<char>& meeting(int item) {
     const double *low = low_[0].data(), *low_y = low_[1].data(), *low_z = low_[2].data(),
                  *high = high_[0].data(), *high_y = high_[1].data(), *high_z = high_[2].data();
     char* meet = meet_.data();
     const int count = static_cast<int>(meet_.size());
-    for (int j = one + 1; j < count; ++j) {
-      meet[j] = (low[one] <= high[j]) & (low[j] <= high[one]) & (low_y[one] <= high_y[j]) &
-                (low_y[j] <= high_y[one]) & (low_z[one] <= high_z[j]) & (low_z[j] <= high_z[one]);
+    for (int j = item + 1; j < count; ++j) {
+      meet[j] = (low[item] <= high[j]) & (low[j] <= high[item]) & (low_y[item] <= high_y[j]) &
+                (low_y[j] <= high_y[item]) & (low_z[item] <= high_z[j]) &
+                (low_z[j] <= high_z[item]);
     }
     return meet_;
   }

@@ -133,9 +133,9 @@ TriangleTree::TriangleTree(std::vector<std::array<int, 3>> triangles, const Buff
 }
 
 int TriangleTree::build(int begin, int end, const std::vector<Vector3d>& middles) {
-  const int own = static_cast<int>(boxes_.size());
+  const int node = static_cast<int>(boxes_.size());
   boxes_.push_back({{}, begin, end, 0});
-  if (end - begin <= leaf_max) return own;
+  if (end - begin <= leaf_max) return node;
   Eigen::AlignedBox3d around;
   for (int i = begin; i < end; ++i) around.extend(middles[order_[i]]);
   int axis = 0;
@@ -146,8 +146,8 @@ int TriangleTree::build(int begin, int end, const std::vector<Vector3d>& middles
         return middles[a][axis] != middles[b][axis] ? middles[a][axis] < middles[b][axis] : a < b;
       });
   build(begin, middle, middles);
-  boxes_[own].right = build(middle, end, middles);
-  return own;
+  boxes_[node].right = build(middle, end, middles);
+  return node;
 }
 
 void TriangleTree::fit(const Buffer<double>& x) {

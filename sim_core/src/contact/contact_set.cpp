@@ -163,10 +163,11 @@ void ContactSet::update(const Buffer<double>& x, double step_length, Buffer<doub
 void ContactSet::add_stiffness(double fraction, std::vector<double>& stiffness) const {
   for (const Pair& pair : pairs_) {
     if (!pair.active()) continue;
-    const double own = fraction * pair.row.symmetric.trace() / (3.0 * pair.proximal_growth);
+    const double pair_stiffness =
+        fraction * pair.row.symmetric.trace() / (3.0 * pair.proximal_growth);
     for (int c = 0; c < 4; ++c) {
       if (pair.stencil.node[c] < free_nodes_)
-        stiffness[pair.stencil.node[c]] += pair.weights[c] * pair.weights[c] * own;
+        stiffness[pair.stencil.node[c]] += pair.weights[c] * pair.weights[c] * pair_stiffness;
     }
   }
 }

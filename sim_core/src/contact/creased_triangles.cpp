@@ -66,17 +66,17 @@ int CreasedTriangles::other(const Sides& sides, int t, int k) const {
 }
 
 void CreasedTriangles::orient(const Sides& sides) {
-  std::vector<char> seen(triangles.size(), 0);
+  std::vector<char> visited(triangles.size(), 0);
   for (std::size_t first = 0; first < triangles.size(); ++first) {
-    if (seen[first]) continue;
+    if (visited[first]) continue;
     std::vector<int> queue{static_cast<int>(first)};
-    seen[first] = 1;
+    visited[first] = 1;
     for (std::size_t q = 0; q < queue.size(); ++q) {
       const int t = queue[q];
       for (int k = 0; k < 3; ++k) {
         const int beyond = other(sides, t, k);
-        if (beyond < 0 || seen[beyond]) continue;
-        seen[beyond] = 1;
+        if (beyond < 0 || visited[beyond]) continue;
+        visited[beyond] = 1;
         if (runs(beyond, triangles[t][next(k)], triangles[t][after_next(k)])) {
           std::swap(triangles[beyond][1], triangles[beyond][2]);
         }

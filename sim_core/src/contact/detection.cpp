@@ -85,11 +85,11 @@ ContactSet::ContactSet(Surface surface, const ContactMaterials& materials_in, do
       has_static_(materials_in.has_static()) {}
 
 void ContactSet::begin(const Buffer<double>& start, const Buffer<double>& ends,
-                       const Buffer<double>& expected, std::vector<Matrix3d> own) {
+                       const Buffer<double>& expected, std::vector<Matrix3d> own_blocks) {
   start_ = &start;
   ends_ = &ends;
   turns_.begin(start, expected, free_nodes_);
-  own_ = std::move(own);
+  own_ = std::move(own_blocks);
   base_ = history_;
   if (has_static_) expected_ = expected;
 }

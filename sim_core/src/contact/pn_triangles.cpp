@@ -115,7 +115,7 @@ PNRoot::PNRoot(const PNPatch& patch, const Vector3d& p) {
     height = height_ratio * normal.norm();
     normal.normalize();
     point = patch.y(b);
-    found = true;
+    is_solved = true;
     return;
   }
 }
@@ -161,15 +161,15 @@ PatchShape PNTriangles::shape(const Buffer<double>& x) const {
 Vector3d PNTriangles::edge_handle(const PatchShape& shape, int t, int from, int to) const {
   const Vector3d p = at_node(shape.x, mesh_.triangles[t][from]),
                  chord = at_node(shape.x, mesh_.triangles[t][to]) - p;
-  const Vector3d& own = shape.normals[mesh_.group[t][from]];
+  const Vector3d& normal = shape.normals[mesh_.group[t][from]];
   const int k = 3 - from - to, other = mesh_.across[t][k];
   if (mesh_.sharp[t][k] && other >= 0) {
     const Vector3d& beyond =
         shape.normals[mesh_.group[other][mesh_.corner_of(other, mesh_.triangles[t][from])]];
-    const Vector3d both = own.cross(beyond);
+    const Vector3d both = normal.cross(beyond);
     if (both.norm() > same_normal) return p + chord.dot(both) / both.squaredNorm() * both / 3.0;
   }
-  return p + (chord - chord.dot(own) * own) / 3.0;
+  return p + (chord - chord.dot(normal) * normal) / 3.0;
 }
 
 PNPatch PNTriangles::patch(const PatchShape& shape, int t) const {
@@ -201,16 +201,16 @@ std::optional<Projection> PNTriangles::projection(const PatchShape& shape, const
     const PNRoot root(patch(shape, t), p);
     int out = 0;
     const double least = root.b.minCoeff(&out);
-    if (root.found && least >= inside)
+    if (root.is_solved && least >= inside)
       return Projection{t, root.b, root.point, side * root.normal, side * root.height, true};
-    if (!root.found && least >= inside) return std::nullopt;
+    if (!root.is_solved && least >= inside) return std::nullopt;
     if (mesh_.sharp[t][out] && root.b[next(out)] < inside && !mesh_.sharp[t][next(out)])
       out = next(out);
     if (mesh_.sharp[t][out] && root.b[after_next(out)] < inside && !mesh_.sharp[t][after_next(out)])
       out = after_next(out);
     if (mesh_.sharp[t][out]) return foot_around(shape, p, t, side);
     const int beyond = mesh_.across[t][out];
-    if (beyond == before && root.found && least >= -between_triangles) {
+    if (beyond == before && root.is_solved && least >= -between_triangles) {
       return Projection{t, root.b, root.point, side * root.normal, side * root.height, true};
     }
     before = std::exchange(t, beyond);
@@ -222,31 +222,32 @@ std::optional<Projection> PNTriangles::projection(const PatchShape& shape, const
 // these.
 std::optional<Projection> PNTriangles::foot_around(const PatchShape& shape, const Vector3d& p,
                                                    int t, double side) const {
-  std::vector<int> some;
+  std::vector<int> near_triangles;
   for (int node : mesh_.triangles[t]) {
-    some.insert(some.end(), mesh_.around.begin() + mesh_.around_begin[node],
-                mesh_.around.begin() + mesh_.around_begin[node + 1]);
+    near_triangles.insert(near_triangles.end(), mesh_.around.begin() + mesh_.around_begin[node],
+                          mesh_.around.begin() + mesh_.around_begin[node + 1]);
   }
-  std::sort(some.begin(), some.end());
-  some.erase(std::unique(some.begin(), some.end()), some.end());
+  std::sort(near_triangles.begin(), near_triangles.end());
+  near_triangles.erase(std::unique(near_triangles.begin(), near_triangles.end()),
+                       near_triangles.end());
   std::optional<Projection> best;
   const auto take = [&](const Projection& projection) {
     if (!best || projection.height < best->height) best = projection;
   };
-  for (int q : some) {
-    const PNPatch one = patch(shape, q);
-    const PNRoot root(one, p);
-    if (root.found && root.b.minCoeff() >= inside && side * root.height > 0.0) {
+  for (int q : near_triangles) {
+    const PNPatch near_patch = patch(shape, q);
+    const PNRoot root(near_patch, p);
+    if (root.is_solved && root.b.minCoeff() >= inside && side * root.height > 0.0) {
       take({q, root.b, root.point, side * root.normal, side * root.height, true});
     }
     for (int k = 0; k < 3; ++k) {
       if (!mesh_.sharp[q][k]) continue;
       const int i = next(k), j = after_next(k);
-      const double s = one.closest_on_edge(k, p);
+      const double s = near_patch.closest_on_edge(k, p);
       Vector3d b = Vector3d::Zero();
       b[i] = 1.0 - s;
       b[j] = s;
-      const Vector3d c = one.y(b), away = p - c;
+      const Vector3d c = near_patch.y(b), away = p - c;
       const double far = away.norm();
       if (far > 0.0) take({q, b, c, away / far, far, false});
     }
@@ -264,9 +265,9 @@ double PNTriangles::side_of(const PatchShape& shape, const Vector3d& p, int t,
       normal.setZero();
       for (int a = mesh_.around_begin[corners[k]]; a < mesh_.around_begin[corners[k] + 1]; ++a) {
         const auto& corners_there = mesh_.triangles[mesh_.around[a]];
-        const int own = mesh_.corner_of(mesh_.around[a], corners[k]);
-        const Vector3d e = at_node(shape.x, corners_there[next(own)]) - c,
-                       f = at_node(shape.x, corners_there[after_next(own)]) - c;
+        const int corner = mesh_.corner_of(mesh_.around[a], corners[k]);
+        const Vector3d e = at_node(shape.x, corners_there[next(corner)]) - c,
+                       f = at_node(shape.x, corners_there[after_next(corner)]) - c;
         normal +=
             std::atan2(e.cross(f).norm(), e.dot(f)) * mesh_.facet_normal(shape.x, mesh_.around[a]);
       }

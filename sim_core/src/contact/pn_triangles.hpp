@@ -89,7 +89,7 @@ struct PNPatch {
 struct PNRoot {
   Eigen::Vector3d b, normal, point;
   double height = 0.0;  // m
-  bool found = false;
+  bool is_solved = false;
 
   PNRoot(const PNPatch& patch, const Eigen::Vector3d& p);
 };

@@ -94,28 +94,28 @@ void SmoothContact::begin(const Buffer<double>& start, const Buffer<double>& end
                near = began_near(at_start, p, obstacles::corner);
     if (near) touched_.triangle[i] = left_to_pairs;
     if (near || touched_.triangle[i] >= 0 || sheet_of_node_[i] < 0) continue;
-    const double kept =
+    const double least_reach =
         thickness + 0.5 * obstacles::curvature_max * radius_[i] + start_.bulge;  // at most
-    const double reach =
-        kept + obstacles::reach * ((at_node(guess, i) - p - common).norm() + spread + thickness);
-    const Nearest found = tree_.nearest(
+    const double reach = least_reach + obstacles::reach * ((at_node(guess, i) - p - common).norm() +
+                                                           spread + thickness);
+    const Nearest nearest = tree_.nearest(
         p, reach, [&](int t) { return materials_.mu(sheet_of_node_[i], surface_of(t)) >= 0.0; });
-    touched_.triangle[i] = found.triangle;
-    if (found.triangle < 0) continue;
-    touched_.side[i] = patches_.side_of(start_, p, found.triangle, found.weights);
+    touched_.triangle[i] = nearest.triangle;
+    if (nearest.triangle < 0) continue;
+    touched_.side[i] = patches_.side_of(start_, p, nearest.triangle, nearest.weights);
     if (came && !depenetration(i, p, 0.0).isZero()) touched_.triangle[i] = left_to_pairs;
   }
 }
 
 std::optional<SmoothTouch> SmoothContact::touch(int node, const Vector3d& p) {
   if (touched_.triangle[node] < 0) return std::nullopt;
-  const std::optional<Projection> found =
+  const std::optional<Projection> projection =
       patches_.projection(end_, p, touched_.triangle[node], touched_.side[node]);
-  if (!found) return std::nullopt;
-  if (found->on_patch) touched_.triangle[node] = found->triangle;
-  projections_[node] = *found;
-  return SmoothTouch{found->height - rest_distance(end_, node, *found), found->normal,
-                     surface_of(found->triangle) - materials_.sheets};
+  if (!projection) return std::nullopt;
+  if (projection->on_patch) touched_.triangle[node] = projection->triangle;
+  projections_[node] = *projection;
+  return SmoothTouch{projection->height - rest_distance(end_, node, *projection),
+                     projection->normal, surface_of(projection->triangle) - materials_.sheets};
 }
 
 // What a node keeps, m: pairs stay idle as long as the triangles around it lie on the surface.
@@ -159,17 +159,17 @@ double SmoothContact::mu(int node, Cone cone) const {
 
 Vector3d SmoothContact::normal_near(int node, const Vector3d& p) const {
   const Projection& last = projections_[node];
-  const std::optional<Projection> found =
+  const std::optional<Projection> projection =
       patches_.projection(end_, p, last.triangle, touched_.side[node]);
-  return found ? found->normal : last.normal;
+  return projection ? projection->normal : last.normal;
 }
 
 std::optional<SmoothTouch> SmoothContact::touch_near(int node, const Vector3d& p) const {
-  const std::optional<Projection> found =
+  const std::optional<Projection> projection =
       patches_.projection(end_, p, projections_[node].triangle, touched_.side[node]);
-  if (!found) return std::nullopt;
-  return SmoothTouch{found->height - rest_distance(end_, node, *found), found->normal,
-                     surface_of(found->triangle) - materials_.sheets};
+  if (!projection) return std::nullopt;
+  return SmoothTouch{projection->height - rest_distance(end_, node, *projection),
+                     projection->normal, surface_of(projection->triangle) - materials_.sheets};
 }
 
 }  // namespace sim_core

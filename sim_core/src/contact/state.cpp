@@ -89,10 +89,10 @@ ContactRows ContactState::rows() const {
   return {mode.data(), normal.data(), direction.data(), coupling.data(), turn_stiffness.data()};
 }
 
-void ContactState::factor_block(int node, double own, float* out) const {
+void ContactState::factor_block(int node, double own_stiffness, float* out) const {
   std::fill(out, out + 6, 0.0f);
   if (mode[node] == contact_open) return;
-  const float k = static_cast<float>(stiffness::factor) * static_cast<float>(own);
+  const float k = static_cast<float>(stiffness::factor) * static_cast<float>(own_stiffness);
   const float* n = &normal[4L * node];
   const float* t = &direction[4L * node];
   const float side = mode[node] == contact_stick ? k : std::min(turn_stiffness[node], k);
@@ -161,9 +161,9 @@ ForceNorms ContactState::classify_contacts(const Buffer<double>& x, const Buffer
     const Vector3d p = at_node(x, i);
     BodyContact on = body_contact(at_end, p, i);
     if (surfaces) {
-      const std::optional<SmoothTouch> one = surfaces->touch(i, p);
-      if (one && one->gap < on.gap.distance)
-        on = {{one->gap, one->normal}, static_cast<int>(at_end.size()) + one->surface};
+      const std::optional<SmoothTouch> touch = surfaces->touch(i, p);
+      if (touch && touch->gap < on.gap.distance)
+        on = {{touch->gap, touch->normal}, static_cast<int>(at_end.size()) + touch->surface};
     }
     const Vector3d r = at_node(residual, i) - press(on, i);
     const bool bears = on.body >= 0 && r.dot(on.gap.normal) - stiffness[i] * on.gap.distance > 0.0;
@@ -221,9 +221,9 @@ bool ContactState::warm_start(const Buffer<double>& x, const Buffer<double>& sta
       on = body_contact(at_end, at_node(x, node), node);
       if (on.body != body) on = {gap_of(at_end[body], at_node(x, node)), body};
     } else {
-      const std::optional<SmoothTouch> one = surfaces->touch(node, at_node(x, node));
-      if (!one) continue;
-      on = {{one->gap, one->normal}, body};
+      const std::optional<SmoothTouch> touch = surfaces->touch(node, at_node(x, node));
+      if (!touch) continue;
+      on = {{touch->gap, touch->normal}, body};
     }
     if (resting_.applies) choose_cone(node, on, x, start, at_start, at_end);
     const Contact contact = contact_at(node, on, x, start, residual, at_start, at_end);

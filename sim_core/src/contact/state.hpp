@@ -122,9 +122,10 @@ struct BodyContact {
 
   template <class Of>
   auto mean(const Of& of) const {
-    const auto own = of(body);
-    auto out = own;
-    for (int k = 0; k < 2 && neighbours[k] >= 0; ++k) out += weights[k] * (of(neighbours[k]) - own);
+    const auto of_body = of(body);
+    auto out = of_body;
+    for (int k = 0; k < 2 && neighbours[k] >= 0; ++k)
+      out += weights[k] * (of(neighbours[k]) - of_body);
     return out;
   }
 
@@ -209,7 +210,7 @@ class ContactState {
   // What contact adds to the block of a node in the matrix that is factorised: xx xy xz yy yz zz,
   // N/m. k n n^T where it slips, and the stiffness against a turn of friction, which mu sets; k in
   // all directions where it sticks; k by the node's own stiffness.
-  void factor_block(int node, double own, float* out) const;
+  void factor_block(int node, double own_stiffness, float* out) const;
 
  private:
   void write(int node, const NodeRow& row);

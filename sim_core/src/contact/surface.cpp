@@ -47,14 +47,15 @@ Surface::Surface(std::vector<std::array<int, 3>> triangles_in, std::vector<int> 
   edges.erase(std::unique(edges.begin(), edges.end()), edges.end());
   triangles_of_edge.assign(edges.size(), 0);
   for (const auto& corners : triangles) {
-    std::array<int, 3> own;
+    std::array<int, 3> edges_of_triangle;
     for (int c = 0; c < 3; ++c) {
       const int i = corners[(c + 1) % 3], j = corners[(c + 2) % 3];
       const std::array<int, 2> edge{std::min(i, j), std::max(i, j)};
-      own[c] = static_cast<int>(std::lower_bound(edges.begin(), edges.end(), edge) - edges.begin());
-      ++triangles_of_edge[own[c]];
+      edges_of_triangle[c] =
+          static_cast<int>(std::lower_bound(edges.begin(), edges.end(), edge) - edges.begin());
+      ++triangles_of_edge[edges_of_triangle[c]];
     }
-    triangle_edges.push_back(own);
+    triangle_edges.push_back(edges_of_triangle);
   }
   for (std::size_t i = 0; i < sheet_of_node.size(); ++i) {
     if (around_begin[i + 1] > 0) vertices.push_back(static_cast<int>(i));

@@ -37,9 +37,9 @@ std::pair<Rows4, bool> relaxed(const AnyRod& rod, const Rows4& quaternions, bool
   NewtonWorkspace<1> work(n);
   minimise(rod, level, work, chain_tolerance);
   if (again && level.converged.v[0] != 0) minimise(rod, level, work, chain_tolerance);
-  Rows4 found(n + 1, 4);
-  for (int i = 0; i <= n; ++i) set_frame(found, i, level.frame[i]);
-  return {found, level.stable.v[0] != 0};
+  Rows4 rows(n + 1, 4);
+  for (int i = 0; i <= n; ++i) set_frame(rows, i, level.frame[i]);
+  return {rows, level.stable.v[0] != 0};
 }
 
 }  // namespace

@@ -197,26 +197,26 @@ class Cloth:
             of_sheets = self.self_contact.of_sheets(sheets)
             mu[:sheets, :sheets], mu_static[:sheets, :sheets], thickness = of_sheets
         for column, surface in enumerate(self.surfaces, start=sheets):
-            own = np.asarray(surface.mu, float)
+            kinetic = np.asarray(surface.mu, float)
             # A surface does not have the number of sheets, so it could not check its friction.
-            if own.ndim and own.shape != (sheets,):
+            if kinetic.ndim and kinetic.shape != (sheets,):
                 raise ValueError(
-                    f"mu: of a surface must be one or of {sheets} sheets, got {own.tolist()}"
+                    f"mu: of a surface must be one or of {sheets} sheets, got {kinetic.tolist()}"
                 )
-            mu[:sheets, column] = mu[column, :sheets] = own
-            resting = own if surface.mu_static is None else np.asarray(surface.mu_static, float)
+            mu[:sheets, column] = mu[column, :sheets] = kinetic
+            resting = kinetic if surface.mu_static is None else np.asarray(surface.mu_static, float)
             mu_static[:sheets, column] = mu_static[column, :sheets] = resting
         skins = [surface.thickness for surface in self.surfaces]
         return mu, mu_static, np.append(thickness, skins)
 
     def _surfaces_at(self, time: float) -> Floats:
-        found = [surface.at(time) for surface in self.surfaces]
+        corners = [surface.at(time) for surface in self.surfaces]
         # A function of time may return more or fewer vertices than it did at the start.
-        if [len(one) for one in found] != self._surface_sizes:
+        if [len(points) for points in corners] != self._surface_sizes:
             raise ValueError(
                 f"positions: of surfaces must keep their vertices, and do not at {time:g} s"
             )
-        return np.concatenate([np.empty((0, 3)), *found])
+        return np.concatenate([np.empty((0, 3)), *corners])
 
     @property
     def kernel(self) -> str:
@@ -439,9 +439,9 @@ class Cloth:
             if path is not None:
                 held, poses = path(at)
             else:
-                found = [motion(time) for time in times]
-                held = np.array([np.asarray(one[1], float) for one in found])
-                poses = np.array([[body.pose for body in one[2]] for one in found])
+                instants = [motion(time) for time in times]
+                held = np.array([np.asarray(instant[1], float) for instant in instants])
+                poses = np.array([[body.pose for body in instant[2]] for instant in instants])
             corners: ArrayLike = np.empty((len(at), 0, 3))
             if self.surfaces:
                 corners = [self._surfaces_at(time) for time in times]

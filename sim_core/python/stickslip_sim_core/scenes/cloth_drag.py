@@ -266,16 +266,18 @@ def family(
         speed: Factor of the speed of the holders, likewise.
         settings: Other arguments of `scene`.
     """
-    made = fabric(material) if isinstance(material, str) else material
+    cloth_fabric = fabric(material) if isinstance(material, str) else material
     mesh = settings.pop("mesh", 41)
     preset = settings.pop("preset", "certified")
-    drag = Drag(fabric=made, mu=mu, mesh=_square(mesh), preset=preset_named(preset), **settings)
+    drag = Drag(
+        fabric=cloth_fabric, mu=mu, mesh=_square(mesh), preset=preset_named(preset), **settings
+    )
 
     def make(values: Mapping[str, float], hanging: Hang) -> Scene:
         factors = {name: values[name] for name in ("density", "bending", "stretching")}
         varied = replace(
             drag,
-            fabric=made.scaled(**factors),
+            fabric=cloth_fabric.scaled(**factors),
             mu=values["mu"],
             static_ratio=values["static_ratio"],
             speed=values["speed"],
@@ -339,7 +341,7 @@ def _forces(cloth: Cloth, hung: Hung) -> Record:
     return {"contact_force": cloth.contact_force(), "holder_force": holders}
 
 
-def _labels(run: ClothRun, hung: Hung, made: Fabric) -> dict[str, Any]:
+def _labels(run: ClothRun, hung: Hung, cloth_fabric: Fabric) -> dict[str, Any]:
     """Return the labels of a drop: the fabric, the bias, and the side on which the cloth landed.
 
     `landed_side` is the sign of the mean x of the cloth minus the mean x of the holders, in the
@@ -350,4 +352,9 @@ def _labels(run: ClothRun, hung: Hung, made: Fabric) -> dict[str, Any]:
     if frame < len(run.positions):
         x = run.positions[frame, :, 0]
         landed = int(np.sign(x.mean() - x[hung.held].mean()))
-    return {**fabric_labels(made), "bias_side": hung.side, "bias": hung.bias, "landed_side": landed}
+    return {
+        **fabric_labels(cloth_fabric),
+        "bias_side": hung.side,
+        "bias": hung.bias,
+        "landed_side": landed,
+    }

@@ -419,14 +419,16 @@ class Scene:
         return Outcome({**single, "self_intersections": crossings}, run.labels)
 
 
-def fabric_labels(made: Fabric, prefix: str = "") -> dict[str, Any]:
+def fabric_labels(cloth_fabric: Fabric, prefix: str = "") -> dict[str, Any]:
     """Return the labels of a fabric, whose names begin with `prefix`."""
     return {
-        f"{prefix}areal_density": made.density,
-        f"{prefix}bending_rigidity": np.diag(made.rigidity).tolist(),
+        f"{prefix}areal_density": cloth_fabric.density,
+        f"{prefix}bending_rigidity": np.diag(cloth_fabric.rigidity).tolist(),
         # The inverse of the card's number: constant bending is its limit 0, and not infinity.
-        f"{prefix}softening_length": 0.0 if made.softening is None else 1.0 / made.softening,
-        f"{prefix}stretching_stiffness": made.stretching[0].tolist(),
+        f"{prefix}softening_length": 0.0
+        if cloth_fabric.softening is None
+        else 1.0 / cloth_fabric.softening,
+        f"{prefix}stretching_stiffness": cloth_fabric.stretching[0].tolist(),
     }
 
 
@@ -454,5 +456,5 @@ def _of_materials(physics: Mapping[str, Any]) -> dict[str, Any]:
     known = dict(physics)
     name = known.pop("material")
     numbers = known.pop("fabric", None)
-    made = fabric(name) if numbers is None else fabric_of_card(name, numbers)
-    return {**known, "material": made}
+    cloth_fabric = fabric(name) if numbers is None else fabric_of_card(name, numbers)
+    return {**known, "material": cloth_fabric}
