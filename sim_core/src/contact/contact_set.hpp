@@ -197,7 +197,7 @@ class ContactSet {
   bool has_static_;          // whether friction of any two is larger while they rest
   Buffer<double> expected_;  // (nodes, 4): where velocities lead, if so, m
   Turns turns_;
-  std::vector<Eigen::Matrix3d> own_;
+  std::vector<Eigen::Matrix3d> own_blocks_;
   std::vector<NearFeature> near_features_;       // of the vertex at hand
   std::vector<Pair> pairs_;                      // sorted by kind, first, feature
   std::vector<PairPast> base_, history_, best_;  // likewise

@@ -89,7 +89,7 @@ void ContactSet::begin(const Buffer<double>& start, const Buffer<double>& ends,
   start_ = &start;
   ends_ = &ends;
   turns_.begin(start, expected, free_nodes_);
-  own_ = std::move(own_blocks);
+  own_blocks_ = std::move(own_blocks);
   base_ = history_;
   if (has_static_) expected_ = expected;
 }
@@ -215,7 +215,7 @@ ContactSet::Compliance ContactSet::compliance(const Candidate& stencil, const Ve
   Compliance sum{0.0, 0.0};
   for (int c = 0; c < 4; ++c) {
     if (stencil.node[c] >= free_nodes_) continue;
-    const Matrix3d& node_stiffness = own_[stencil.node[c]];
+    const Matrix3d& node_stiffness = own_blocks_[stencil.node[c]];
     const double mean = node_stiffness.trace() / 3.0;
     const double along_normal =
         mean_fraction * mean + std::max(normal.dot(node_stiffness * normal), 0.0);

@@ -290,10 +290,10 @@ Vector3d PNTriangles::point(const PatchShape& shape, int t, const Vector3d& weig
 }
 
 Matrix3d PNTriangles::axes(const PatchShape& shape, int t, const Vector3d& weights) const {
-  const PNPatch one = patch(shape, t);
-  const Matrix3d slope = one.dy(weights);
+  const PNPatch pn_patch = patch(shape, t);
+  const Matrix3d slope = pn_patch.dy(weights);
   Matrix3d out;
-  out.col(2) = one.n(weights).normalized();
+  out.col(2) = pn_patch.n(weights).normalized();
   out.col(1) = out.col(2).cross(slope.col(1) - slope.col(0)).normalized();
   out.col(0) = out.col(1).cross(out.col(2));
   return out;
