@@ -236,5 +236,6 @@ def test_the_readme_has_the_measured_minutes_and_gigabytes() -> None:
     assert f"{runtime:.1f} GB of disk" in text
     assert f"{with_tests:.1f} GB with the tools of the tests" in text
     minutes = MEASUREMENTS["minutes"]
-    assert f"make demo # {minutes['setup']} minutes to set up, {minutes['demo']} to run" in text
-    assert f"make test # {minutes['setup-dev']} minutes to set up, {minutes['test']} to run" in text
+    for command, setup, run in (("demo", "setup", "demo"), ("test", "setup-dev", "test")):
+        unit = "minute" if minutes[setup] == 1 else "minutes"
+        assert f"make {command} # {minutes[setup]} {unit} to set up, {minutes[run]} to run" in text
