@@ -22,8 +22,8 @@ FRICTIONS = np.linspace(0.1, 1.6, 16).round(2)
 SELF_FRICTION = 0.5
 
 
-class Drag(NamedTuple):
-    """A drag of the grid."""
+class GridPoint(NamedTuple):
+    """The parameters of a drag of the grid."""
 
     material: str
     mu: float
@@ -31,22 +31,22 @@ class Drag(NamedTuple):
     preset: str
 
 
-def report(drag: Drag) -> dict[str, Any]:
+def report(point: GridPoint) -> dict[str, Any]:
     """Run a drag, and return its verdict and the largest share of a limit."""
     begin = time.process_time()
     run = cloth_drag.scene(
-        drag.material,
-        drag.mu,
-        mesh=drag.mesh,
-        preset=drag.preset,
+        point.material,
+        point.mu,
+        mesh=point.mesh,
+        preset=point.preset,
         self_friction=SELF_FRICTION,
-        seed=round(1000 * drag.mu),
+        seed=round(1000 * point.mu),
     ).run()
     shares = {check.name: run.labels[check.name] / check.limit for check in CHECKS if check.limit}
     nearest = max(shares, key=lambda name: shares[name])
     return {
-        "material": drag.material,
-        "mu": drag.mu,
+        "material": point.material,
+        "mu": point.mu,
         "valid": run.valid,
         "reason": run.reason,
         "nearest": nearest,
@@ -64,13 +64,13 @@ def main() -> None:
     parser.add_argument("--preset", default="certified")
     parser.add_argument("--processes", type=int, default=2)
     options = parser.parse_args()
-    drags = [
-        Drag(material, float(mu), options.mesh, options.preset)
+    points = [
+        GridPoint(material, float(mu), options.mesh, options.preset)
         for material in fabric_names()
         for mu in FRICTIONS
     ]
     with multiprocessing.Pool(options.processes) as pool:
-        reports = pool.map(report, drags, chunksize=1)
+        reports = pool.map(report, points, chunksize=1)
     for each in reports:
         if not each["valid"]:
             print(json.dumps(each))

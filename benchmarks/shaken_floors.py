@@ -30,7 +30,7 @@ STEP = 1e-5
 """Step of the integration of the block [s]."""
 
 FRAME_RATE = 1000.0
-"""Frames in a second: the times of comparison are between two of them at most half of 1 ms."""
+"""Frames in a second: a time of comparison is at most half a millisecond from a frame."""
 
 LARGEST_ERROR = 0.05
 """Error up to which a valid run is right."""
@@ -55,7 +55,7 @@ class Floor:
         return self.size * (1.0 - math.cos(phase))
 
 
-def drawn(number: int, draw: int, frequencies: Sequence[float]) -> list[Floor]:
+def drawn_floors(number: int, draw: int, frequencies: Sequence[float]) -> list[Floor]:
     """Return floors whose numbers are drawn evenly, frequency and size by their logarithms.
 
     The frequencies are the given ones in turn, if there are any.
@@ -109,7 +109,7 @@ def main() -> None:
     parser.add_argument("--frequencies", type=float, nargs="+", default=(), help="[1/s]")
     options = parser.parse_args()
     valid_errors = []
-    for floor in drawn(options.floors, options.draw, options.frequencies):
+    for floor in drawn_floors(options.floors, options.draw, options.frequencies):
         run = patch_on(floor, options.preset).run()
         if not run.valid:
             continue
@@ -117,6 +117,9 @@ def main() -> None:
         valid_errors.append(error)
         if error > LARGEST_ERROR:
             print(f"{error:.1%}: {floor}", flush=True)
+    if not valid_errors:
+        print(f"{options.preset}: none of {options.floors} valid")
+        return
     print(
         f"{options.preset}: {len(valid_errors)} of {options.floors} valid, "
         f"median {statistics.median(valid_errors):.2%}, largest {max(valid_errors):.2%}, "

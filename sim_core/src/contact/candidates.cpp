@@ -90,7 +90,7 @@ class Around {
     }
     meet_.resize(static_cast<std::size_t>(end - begin));
   }
-  // Of those after one: whether they meet it.
+  // Returns of each item whether it meets the given one, for those after that.
   const std::vector<char>& meeting(int item) {
     const double *low = low_[0].data(), *low_y = low_[1].data(), *low_z = low_[2].data(),
                  *high = high_[0].data(), *high_y = high_[1].data(), *high_z = high_[2].data();

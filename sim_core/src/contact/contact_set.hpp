@@ -100,7 +100,8 @@ class ContactSet {
   // Forgets what slid, too: another state is set.
   void forget_cones() { ended_.clear(); }
   // Begins an attempt at a step from `start`, with the forces kept last. Held nodes go to `ends`;
-  // all nodes are `expected` where velocities lead. `own_blocks`: of the free nodes, N/m.
+  // all nodes are `expected` where velocities lead. `own_blocks` has the stiffness of each free
+  // node, N/m.
   void begin(const Buffer<double>& start, const Buffer<double>& ends,
              const Buffer<double>& expected, std::vector<Eigen::Matrix3d> own_blocks);
   // After a step was solved: gives pairs the cones that hold now, and keeps their forces for the

@@ -94,10 +94,11 @@ void SmoothContact::begin(const Buffer<double>& start, const Buffer<double>& end
                near = began_near(at_start, p, obstacles::corner);
     if (near) touched_.triangle[i] = left_to_pairs;
     if (near || touched_.triangle[i] >= 0 || sheet_of_node_[i] < 0) continue;
-    const double least_reach =
-        thickness + 0.5 * obstacles::curvature_max * radius_[i] + start_.bulge;  // at most
-    const double reach = least_reach + obstacles::reach * ((at_node(guess, i) - p - common).norm() +
-                                                           spread + thickness);
+    const double rest_distance_max =
+        thickness + 0.5 * obstacles::curvature_max * radius_[i] + start_.bulge;
+    const double reach =
+        rest_distance_max +
+        obstacles::reach * ((at_node(guess, i) - p - common).norm() + spread + thickness);
     const Nearest nearest = tree_.nearest(
         p, reach, [&](int t) { return materials_.mu(sheet_of_node_[i], surface_of(t)) >= 0.0; });
     touched_.triangle[i] = nearest.triangle;
