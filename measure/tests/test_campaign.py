@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from stickslip_measure.cli import main
 from stickslip_measure.convergence import converged
 from stickslip_measure.diagnosis import findings
 from stickslip_measure.experiments import capstan, drape, slopes, strips
+from stickslip_measure.laboratory import DOWN, NoValueError, SleepError, settled
 from stickslip_measure.page import write_page
 from stickslip_measure.process import Program
 from stickslip_sim_core.reference import master_curves
@@ -209,6 +211,41 @@ def test_an_adapter_that_cannot_be_imported(
     program = falling(start="pass", name="undefined")
     assert main(["--simulator", str(program.adapter), "--out", str(tmp_path / "out")]) == 1
     assert "could not be set up: NameError" in capsys.readouterr().err
+
+
+class Moving:
+    """A scene of one vertex, whose height is a function of the time."""
+
+    def __init__(self, height: Callable[[float], float]) -> None:
+        self.height = height
+        self.time = 0.0
+        self.positions = np.array([[0.0, 0.0, height(0.0)]])
+
+    def rest(self, seconds: float, gravity: object) -> np.ndarray:
+        times = self.time + seconds * np.arange(1, 26) / 25.0
+        frames = np.array([[[0.0, 0.0, self.height(time)]] for time in times])
+        self.time = times[-1]
+        self.positions = frames[-1]
+        return frames
+
+
+def test_a_scene_that_swings_rests_at_its_mean() -> None:
+    swing: Any = Moving(lambda time: 0.02 + 0.05 * np.sin(9.0 * time))
+    assert settled(swing, DOWN, 0.1, 12.0)[0, 2] == pytest.approx(0.02, abs=3e-3)
+
+
+def test_a_scene_that_goes_on_moving_has_no_rest() -> None:
+    sagging: Any = Moving(lambda time: -0.01 * time)
+    with pytest.raises(NoValueError, match=r"did not come to rest in 12 s: .* moves by 30 mm"):
+        settled(sagging, DOWN, 0.1, 12.0)
+
+
+def test_a_patch_that_sticks_does_not_sleep() -> None:
+    slopes.check_nudge(slopes.Nudge(0.1, 0.99))
+    with pytest.raises(SleepError, match=r"3\.0 times the slip moved it by 0 mm"):
+        slopes.check_nudge(slopes.Nudge(0.0, 0.0))
+    with pytest.raises(NoValueError, match=r"it sticks: .* moved it by 0\.09 of the closed form"):
+        slopes.check_nudge(slopes.Nudge(0.01, 0.09))
 
 
 # The closed forms of the experiments, against others.

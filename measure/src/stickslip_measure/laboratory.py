@@ -23,6 +23,13 @@ REST_SHARE = 1e-5
 LOOK = 0.25
 """Time between two looks at a scene that settles [s]."""
 
+STEADY_SHARE = 0.05
+"""Share of its length by which the mean of a scene that swings may differ between two quarters.
+
+A strip that swings by half of its length without damping differs by 4 %, since a quarter has no
+whole number of swings.
+"""
+
 
 class NoValueError(AdapterError):
     """The scene ran, and its motion has no number."""
@@ -162,6 +169,9 @@ def settled(simulation: Simulation, gravity: Floats, length: float, longest: flo
         gravity: Gravity (3,) [m/s^2].
         length: Size of the scene [m].
         longest: Time limit [s].
+
+    Raises:
+        NoValueError: The means of the last two quarters differ.
     """
     means = []
     for _ in range(round(longest / LOOK)):
@@ -170,4 +180,11 @@ def settled(simulation: Simulation, gravity: Floats, length: float, longest: flo
         means.append(frames.mean(axis=0))
         if float(np.abs(simulation.positions - before).max()) < REST_SHARE * length:
             return simulation.positions
-    return np.asarray(np.mean(means[len(means) // 2 :], axis=0))
+    third, fourth = (np.mean(part, axis=0) for part in np.array_split(means[len(means) // 2 :], 2))
+    moving = float(np.abs(fourth - third).max())
+    if moving > STEADY_SHARE * length:
+        raise NoValueError(
+            f"it did not come to rest in {longest:g} s: between the last two quarters of this time "
+            f"its mean moves by {1e3 * moving:.3g} mm"
+        )
+    return np.asarray(0.5 * (third + fourth))

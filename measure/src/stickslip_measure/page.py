@@ -36,21 +36,29 @@ def write_page(out: Path) -> Path:
     Raises:
         ValueError: A file of the folder is no cell.
     """
-    cells = read_cells(out)
+    page = out / "index.html"
+    page.write_text(page_text(read_cells(out), read_simulators(out)), encoding="utf-8")
+    return page
+
+
+def page_text(cells: Sequence[Cell], simulators: Sequence[Mapping[str, Any]]) -> str:
+    """Return the page.
+
+    Args:
+        cells: Cells of all simulators.
+        simulators: The description of each simulator, as `simulator.json` has it.
+    """
     rows = rows_of(cells)
-    text = TEMPLATE.substitute(
+    return TEMPLATE.substitute(
         version=escape(__version__),
         overview=overview(rows),
         findings="".join(finding_items(rows)),
         experiments="".join(section(experiment, rows) for experiment in chosen(rows)),
         simulators="".join(
             simulator_text(facts, [cell for cell in cells if cell.simulator == facts["name"]])
-            for facts in read_simulators(out)
+            for facts in simulators
         ),
     )
-    page = out / "index.html"
-    page.write_text(text, encoding="utf-8")
-    return page
 
 
 def rows_of(cells: Sequence[Cell]) -> dict[Row, list[Cell]]:

@@ -8,10 +8,15 @@ import numpy as np
 import pybullet
 
 MARGIN = 1e-3  # m
-DAMPING = 0.1  # of springs, as in Bullet's examples: without it they diverge
-SPRINGS = f"Y along edges, D / cell^2 across them, damping {DAMPING}; margin 1 mm"
-STEPS = {"default": 1.0 / 240.0, "tuned": 1.0 / 960.0}
-ITERATIONS = {"default": 50, "tuned": 200}
+FRAME = 1.0 / 240.0  # s, the default step
+SPRINGS = 8  # at an inner vertex, without those across edges
+DAMPING = {"default": 0.1, "tuned": 0.0}  # of springs; Bullet has 0.1 by default
+CHOICES = {
+    "iterations": 50,
+    "springs": "Y along edges, D / cell^2 across them; steps explicit in them",
+    "bending": "springs across edges do not resist the bending of a flat sheet to first order",
+    "margin": "1 mm",
+}
 THICK = 1.0  # of a box that stands for a plane [m]
 WIDE = 20.0  # m
 
@@ -24,21 +29,21 @@ class Simulator:
     capabilities = frozenset({"held", "floor", "planes", "cylinders"})
     clearance = MARGIN
     settings: ClassVar = {
-        "default": {"step": "1/240 s", "iterations": 50, "springs": SPRINGS},
+        "default": {"step": "1/240 s", "springDampingStiffness": 0.1, **CHOICES},
         "tuned": {
-            "step": "1/960 s",
-            "iterations": 200,
-            "springs": SPRINGS,
-            "source": "PyBullet Quickstart Guide (bullet3), setPhysicsEngineParameter",
+            "step": "1/240 s over the power of 2 for which explicit springs are stable",
+            "springDampingStiffness": 0.0,
+            **CHOICES,
+            "source": "PyBullet Quickstart Guide (bullet3), setTimeStep and loadSoftBody",
         },
     }
+    frame = FRAME
 
     def __init__(self, scene: Any, setting: str) -> None:
         pybullet.connect(pybullet.DIRECT)
         pybullet.resetSimulation(pybullet.RESET_USE_DEFORMABLE_WORLD)
-        self.frame = STEPS[setting]
-        pybullet.setTimeStep(self.frame)
-        pybullet.setPhysicsEngineParameter(numSolverIterations=ITERATIONS[setting])
+        self.substeps = substeps(scene) if setting == "tuned" else 1
+        pybullet.setTimeStep(FRAME / self.substeps)
         self.set_gravity(scene.gravity)
         for body in scene.bodies:
             add_body(body)
@@ -48,7 +53,7 @@ class Simulator:
             useMassSpring=1,
             useBendingSprings=1,
             springElasticStiffness=scene.stretching,
-            springDampingStiffness=DAMPING,
+            springDampingStiffness=DAMPING[setting],
             springDampingAllDirections=1,
             springBendingStiffness=scene.bending / scene.cell**2,
             useFaceContact=1,
@@ -68,8 +73,9 @@ class Simulator:
         return np.array(pybullet.getMeshData(self.cloth, -1, flags=flags)[1])
 
     def step(self) -> None:
-        """Advance by a time step."""
-        pybullet.stepSimulation()
+        """Advance by a frame."""
+        for _ in range(self.substeps):
+            pybullet.stepSimulation()
 
     def positions(self) -> Any:
         """Return the vertices."""
@@ -78,6 +84,12 @@ class Simulator:
     def set_gravity(self, gravity: Any) -> None:
         """Change gravity."""
         pybullet.setGravity(*(float(value) for value in gravity))
+
+
+def substeps(scene: Any) -> int:
+    """Return the steps of a frame, each below 2 over the highest frequency of springs."""
+    frequency = np.sqrt(2.0 * SPRINGS * scene.stretching / scene.masses().mean())
+    return int(2 ** np.ceil(np.log2(0.5 * FRAME * frequency)))
 
 
 def add_body(body: Any) -> None:

@@ -267,7 +267,9 @@ def lateral_buckling(laboratory: Laboratory, cells: int) -> Reading:
         raise NoValueError("the strip does not deflect towards its sideways load")
     squares = np.array(SHARES) ** 2
     fit = np.polyfit(1.0 / compliance, squares, 2)
-    buckling = float(np.sqrt(max(fit[-1], 0.0)))
+    if fit[-1] <= 0.0:
+        raise NoValueError("the strip does not become softer sideways as its weight grows")
+    buckling = float(np.sqrt(fit[-1]))
     x = np.array(SHARES)
     # The same stiffness against the sideways load, and the buckling weight of the plate.
     exact = compliance[0] * (1.0 - squares[0]) / (1.0 - squares)
