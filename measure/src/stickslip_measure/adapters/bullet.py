@@ -12,10 +12,8 @@ FRAME = 1.0 / 240.0  # s, the default step
 SPRINGS = 8  # at an inner vertex, without those across edges
 DAMPING = {"default": 0.1, "tuned": 0.0}  # of springs; Bullet has 0.1 by default
 CHOICES = {
-    "iterations": 50,
-    "springs": "Y along edges, D / cell^2 across them; steps explicit in them",
+    "springs": "Y along edges, D / cell^2 across them; steps explicit in them; margin 1 mm",
     "bending": "springs across edges do not resist the bending of a flat sheet to first order",
-    "margin": "1 mm",
 }
 THICK = 1.0  # of a box that stands for a plane [m]
 WIDE = 20.0  # m
@@ -29,12 +27,13 @@ class Simulator:
     capabilities = frozenset({"held", "floor", "planes", "cylinders"})
     clearance = MARGIN
     settings: ClassVar = {
-        "default": {"step": "1/240 s", "springDampingStiffness": 0.1, **CHOICES},
+        "default": {"step": "1/240 s", "springDampingStiffness": 0.1, "sleeping": "on", **CHOICES},
         "tuned": {
             "step": "1/240 s over the power of 2 for which explicit springs are stable",
             "springDampingStiffness": 0.0,
+            "sleeping": "off",
             **CHOICES,
-            "source": "PyBullet Quickstart Guide (bullet3), setTimeStep and loadSoftBody",
+            "source": "PyBullet Quickstart Guide: setTimeStep, loadSoftBody, changeDynamics",
         },
     }
     frame = FRAME
@@ -61,6 +60,9 @@ class Simulator:
             frictionCoeff=max([body.friction for body in scene.bodies], default=0.0),
             collisionMargin=MARGIN,
         )
+        if setting == "tuned":
+            awake = pybullet.ACTIVATION_STATE_DISABLE_SLEEPING
+            pybullet.changeDynamics(self.cloth, -1, activationState=awake)
         # The soft body has another order of vertices.
         distances = np.linalg.norm(self.vertices()[None] - scene.start[:, None], axis=2)
         self.order = distances.argmin(axis=1)

@@ -330,8 +330,8 @@ def creep(laboratory: Laboratory, cells: int) -> Reading:
     moved = slid(frames, start, scene.sheet, 0)
     drift = float(np.abs(frames[-1] - start)[:, :2].max())
     nudge = nudged(simulation, 0)
-    # A sheet that held may have been asleep. Whatever creeps is awake.
-    if drift < HELD:
+    # A sheet that held may have been asleep, and one that crept may have fallen asleep.
+    if drift < HELD or abs(nudge.distance) < ASLEEP:
         check_nudge(nudge)
     details = {"nudge over closed form": nudge.share}
     return Reading(1e3 * drift, 0.0, time, 1e3 * moved, np.zeros_like(time), details)
