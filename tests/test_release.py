@@ -3,6 +3,7 @@ bare environment.
 """
 
 import os
+import re
 import resource
 import subprocess
 import sys
@@ -177,3 +178,36 @@ def test_wheels_install_into_a_bare_environment(wheels: Path, tmp_path: Path) ->
     python = [str(programs / "python"), "-c", code]
     done = subprocess.run(python, capture_output=True, text=True, env=bare, cwd=tmp_path)
     assert done.stdout.startswith(str(place)), done.stdout + done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+@pytest.mark.xdist_group("wheels")  # which are built once
+def test_the_core_alone_is_small_quick_and_needs_numpy(wheels: Path, tmp_path: Path) -> None:
+    (wheel,) = wheels.glob("stickslip_sim_core-*.whl")
+    assert wheel.stat().st_size <= 15e6
+    programs = programs_of(wheels, tmp_path / "venv", "stickslip-sim-core")
+    printed = run_alone(programs, tmp_path, "bare_environment.py")
+    match = re.search(r"import ([0-9.]+) CPU s", printed)
+    assert match is not None, printed
+    assert float(match[1]) <= 0.3
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+@pytest.mark.xdist_group("wheels")  # which are built once
+def test_the_notebook_runs_with_the_wheel_and_matplotlib_alone(
+    wheels: Path, tmp_path: Path
+) -> None:
+    programs = programs_of(wheels, tmp_path / "venv", "stickslip-sim-core", "matplotlib")
+    notebook = ROOT / "sim_core/notebooks/first_steps.ipynb"
+    run_alone(programs, tmp_path, "run_notebook.py", str(notebook))
+
+
+def run_alone(programs: Path, place: Path, script: str, *arguments: str) -> str:
+    """Run a script of the core's tests in a bare environment, and return what it prints."""
+    bare = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    command = [str(programs / "python"), str(ROOT / "sim_core/tests" / script), *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, env=bare, cwd=place)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
