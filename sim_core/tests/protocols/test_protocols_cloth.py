@@ -64,6 +64,17 @@ class TestStickSlip:
             ).all()
         assert set(regime) == {stick_slip.STICK, stick_slip.SLIP, stick_slip.EXTENDED}
 
+    @pytest.mark.parametrize("preset", ["fast", "certified", "fine"])
+    @pytest.mark.parametrize("onset", [0.05, 0.25, 0.5])
+    def test_half_a_step_is_far_below_the_tolerance_of_the_limit(
+        self, preset: str, onset: float
+    ) -> None:
+        """Extrapolation doubles what the finest mesh lacks."""
+        time_step = preset_named(preset).time_step
+        half_a_step = 0.5 * time_step * stick_slip.growth_rate(time_step, onset) / onset
+
+        assert 2.0 * half_a_step <= 0.5 * stick_slip.StickSlip.limit_tolerance
+
     def test_friction_beyond_the_triple_point_is_refused(self) -> None:
         with pytest.raises(ValueError, match="friction: "):
             protocols.run("stick-slip", friction=(0.4,))

@@ -75,7 +75,7 @@ def _worker_row(worker: WorkerEntry) -> tuple[Cell, ...]:
 def certify(client: Client, preset: str, out: Path | None, quick: bool) -> None:
     """Measure a preset on the physical protocols, and register the certificate.
 
-    A full certificate of a cloth preset takes about eight minutes of CPU time. It vouches for this
+    A full certificate of a cloth preset takes two to four minutes of CPU time. It vouches for this
     build and preset only. Writes certificate.json; exits with 1 if the preset does not pass.
     """
     directory = out or Path("certificates") / preset

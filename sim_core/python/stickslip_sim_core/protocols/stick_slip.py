@@ -32,6 +32,9 @@ STRETCHING = 3e4  # N/m
 # resolve such a slip as well.
 RATE = 5e-3
 ROOT = 0.25
+# Largest growth of that root in a step. The slip is known to half a step, which is 2e-4 of the
+# friction at ROOT, and the limit of small cells has up to twice this error. It may be 1e-3.
+ROOT_STEP = 1e-4
 # Damping [1/s]: the bounce of a buckling strip must not tear its tip off.
 DAMPING = 20.0
 
@@ -113,7 +116,8 @@ class StickSlip(RefinedProtocol):
         pressed = strip(CELLS_ACROSS * cell_of(cells), cells, self.kinds[mesh])
         # Frictions beyond the triple point have no strain on the master curve.
         onset = np.sqrt(master_curves.stick_slip_strain(mu)) if mu in self.friction else ROOT
-        outcome = press(pressed, mu, self.solver, end, RATE * min(1.0, float(onset) / ROOT))
+        rate = growth_rate(self.solver.time_step, float(onset))
+        outcome = press(pressed, mu, self.solver, end, rate)
         if mesh == 0 and cells == self.cells[-1]:
             self.diagram += _phases(mu, outcome, end)
         if cells == self.cells[-1] and np.isfinite(outcome.static_error):
@@ -131,6 +135,16 @@ class StickSlip(RefinedProtocol):
             "static_ratio_error": self.tally.largest,
             **dict(zip(("phase_mu", "phase_strain", "phase_regime"), columns, strict=True)),
         }
+
+
+def growth_rate(time_step: float, onset: float) -> float:
+    """Return the growth of the root of the strain [1/s].
+
+    Args:
+        time_step: Length of a step [s].
+        onset: Root of the strain at which the tip is expected to slip.
+    """
+    return min(RATE, ROOT_STEP / time_step) * min(1.0, onset / ROOT)
 
 
 def press(
