@@ -59,7 +59,7 @@ def subcommands(name: str) -> list[tuple[str, ...]]:
     return [(name,)]
 
 
-PASSED_ON = ("export", "measure")
+PASSED_ON = ("export", "film", "measure")
 """Commands whose help is that of another program."""
 
 EVERY = [(), *(words for name in _COMMANDS if name not in PASSED_ON for words in subcommands(name))]

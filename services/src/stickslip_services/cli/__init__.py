@@ -35,7 +35,7 @@ _SECTIONS = {
     "Scenes": {"scene": "specs", "simulate": "specs", "fit": "fitting"},
     "Fabrics": dict.fromkeys(("fabrics", "lab"), "laboratory"),
     "Certificates": dict.fromkeys(("certify", "register", "certificates"), "workers"),
-    "Measurement": {"measure": "measuring", "rods": "rods"},
+    "Measurement": {"measure": "measuring", "rods": "rods", "film": "filming"},
     "Administration": dict.fromkeys(("keys", "projects", "webhooks", "audit-log"), "admin"),
     "Maintenance": dict.fromkeys(("backup", "rm", "gc", "reindex", "scrub"), "maintenance"),
 }

@@ -120,7 +120,12 @@ def load_camera(path: str | Path) -> Camera:
 
 
 def import_video(
-    path: str | Path, camera: Camera, *, start: float | None = None, frame_rate: float | None = None
+    path: str | Path,
+    camera: Camera,
+    *,
+    start: float | None = None,
+    frame_rate: float | None = None,
+    since: float = -math.inf,
 ) -> tuple[Clips, Registration]:
     """Return the clip of a video, of which nothing is known to be true, and the registration.
 
@@ -129,6 +134,7 @@ def import_video(
         camera: The camera that took it.
         start: Time in the video at which the holders start [s]; by default it is found.
         frame_rate: Frames a second; by default the video has the time of every frame.
+        since: Time of the first frame that is read [s]: what is before is no drag.
 
     Raises:
         VideoError: The video cannot be measured.
@@ -137,7 +143,7 @@ def import_video(
         raise VideoError(
             f"frame_rate must be more than 0 frames a second and finite, and is {frame_rate:g}"
         )
-    times, tracks = _follow(path, camera, frame_rate)
+    times, tracks = _follow(path, camera, frame_rate, since)
     _check_times(times)
     registration, holder_motion = _register(times, tracks, camera.straight, start)
     reasons = registration.refusals()
@@ -146,7 +152,7 @@ def import_video(
 
     # Only the frames at the instants that a network reads are decoded in full.
     frames, instants = frames_at((times - registration.start) * RATE)
-    first, *pictures = _pictures(path, camera, [0, *frames])
+    first, *pictures = _pictures(path, camera, [0, *frames], since)
     motion = _camera_motion(first, pictures, holder_motion[frames], camera.width / _WIDE)
 
     # The crop follows the camera, so that the cloth is seen as by a camera that stands still.
@@ -214,8 +220,14 @@ def _camera_motion(
 # -------------------------------------------------------------------------------------
 
 
-def _frames(path: str | Path) -> Iterator[tuple[float, npt.NDArray[np.uint8]]]:
-    """Yield the time [s] and the grey levels (H, W) of every frame."""
+def read_frames(
+    path: str | Path, since: float = -math.inf
+) -> Iterator[tuple[float, npt.NDArray[np.uint8]]]:
+    """Yield the time [s] and the grey levels (H, W) of every frame from a time on [s].
+
+    Raises:
+        VideoError: The file is no video that FFmpeg reads.
+    """
     try:
         import av
     except ModuleNotFoundError as error:
@@ -229,6 +241,8 @@ def _frames(path: str | Path) -> Iterator[tuple[float, npt.NDArray[np.uint8]]]:
             for frame in container.decode(video=0):
                 if frame.time is None:
                     raise VideoError(f"every frame of {path} must have a time, and one has none")
+                if frame.time < since:
+                    continue
                 yield (
                     float(frame.time),
                     frame.to_ndarray(format="gray").astype(np.uint8, copy=False),
@@ -248,7 +262,9 @@ def holder_points(instants: Array) -> Floats:
     )
 
 
-def _follow(path: str | Path, camera: Camera, frame_rate: float | None) -> tuple[Floats, Floats]:
+def _follow(
+    path: str | Path, camera: Camera, frame_rate: float | None, since: float
+) -> tuple[Floats, Floats]:
     """Return times (N,), and places (N, 2, 2) of the held patches without distortion [px]."""
     try:
         import cv2
@@ -265,7 +281,7 @@ def _follow(path: str | Path, camera: Camera, frame_rate: float | None) -> tuple
     tracks: list[Any] = []
     before = reference = None
     patches = reference_patches = start.astype(np.float32)[:, None]
-    for number, (frame_time, picture) in enumerate(_frames(path)):
+    for number, (frame_time, picture) in enumerate(read_frames(path, since)):
         time = frame_time if frame_rate is None else number / frame_rate
         _check_size(picture, camera)
         if before is None:
@@ -354,13 +370,17 @@ def _register(
     return Registration(start, timing, residual), common - common[0]
 
 
-def _pictures(path: str | Path, camera: Camera, chosen: list[int]) -> list[npt.NDArray[np.uint8]]:
+def _pictures(
+    path: str | Path, camera: Camera, chosen: list[int], since: float
+) -> list[npt.NDArray[np.uint8]]:
     """Return some frames without the distortion of the lens, (H, W) each."""
     import cv2
 
     matrix = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
     frames = {
-        number: picture for number, (_, picture) in enumerate(_frames(path)) if number in chosen
+        number: picture
+        for number, (_, picture) in enumerate(read_frames(path, since))
+        if number in chosen
     }
     return [cv2.undistort(frames[number], matrix, np.array(camera.distortion)) for number in chosen]
 

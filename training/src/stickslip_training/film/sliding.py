@@ -1,0 +1,261 @@
+"""How far the cloth has slid on the tray, frame by frame.
+
+Each frame is seen from straight above the tray, by the pose of the tray's board, with the slope
+running down the picture. What lies on the tray stands still there, whatever hand and phone do.
+Small patches of the level tray are looked for further down in the later frames, by their normalised
+correlation, which no change of light disturbs. Patches that stay are tray. Patches that move
+together are cloth, and their common shift is how far it slid. Edges that creep are few, and count
+as neither.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stickslip_training.arrays import Array, Floats, SingleFloats
+from stickslip_training.film.boards import GAP, SIZE
+from stickslip_training.film.poses import Lens, Pose
+
+PIXEL = 1e-3
+"""Side of a pixel of the view from above [m]: about that of a frame that shows a tray."""
+ABOVE = 0.02
+"""The view begins so far from the middle of the board, up the slope [m]."""
+BELOW = 0.42
+"""The view ends so far from the middle of the board, down the slope [m]."""
+BESIDE = 0.16
+"""Half of the width of the view [m]."""
+PATCH = 24
+"""Side of a patch [px]: more than the cells of usual patterns."""
+PATCH_STEP = 16
+"""Distance of patches [px]."""
+REACH = 40
+"""Farthest shift that is looked for down the slope [px]."""
+BACK = 6
+"""Farthest shift up the slope, and aside, that is looked for [px]: poses are off by less."""
+STEP_MAX = 15
+"""Farthest shift between two frames [px]: 0.45 m/s at 30 frames a second."""
+CONTRAST_MIN = 0.3
+"""Least slope of grey levels down the slope, on average [1/px]: a plain cloth has its grain."""
+STILL_MIN = 0.7
+"""Least correlation of a patch that stays."""
+STILL_TILT = np.radians(6.0)
+"""Tilt up to which all that lies on the tray stays [rad]: mu is 0.1 or more. What lies beside the
+tray leaves its place in the view by more than a patch's width until then."""
+STAYS = 2
+"""Largest shift of a patch that has stayed [px]."""
+TRAY_MAX = 40
+"""About the most patches of the tray that are followed: more cost time and tell little."""
+MOVED = 5
+"""Least shift at which a patch has moved [px]: 5 mm on a sheet of true size."""
+MATCH_MIN = 0.6
+"""Least correlation of a patch that has moved."""
+GAIN_MIN = 0.15
+"""Least correlation of a patch that has moved over that at its old place."""
+LOOKS = 15.0
+"""Looks for motion in a second [1/s]: a cloth is in reach for longer."""
+BEFORE = 2.0
+"""Time before the cloth has clearly moved in which its way is followed [s]."""
+CLOTH_MIN = 6
+"""Fewest patches of a cloth: 6 cover 15 square centimetres or more."""
+TOGETHER = 3
+"""Largest difference between shifts of patches that move together [px]."""
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The view from above: a rectangle of the tray's plane."""
+
+    downhill: Floats
+    """Unit vector down the slope, on the board, (2,)."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Return height and width of the view [px]."""
+        return round((ABOVE + BELOW) / PIXEL), round(2 * BESIDE / PIXEL)
+
+    def points(self, every: int = 1) -> Floats:
+        """Return the places of pixels on the board, (H, W, 2) [m], of each so many pixels."""
+        height, width = self.shape
+        down = np.arange(0, height, every) * PIXEL - ABOVE
+        aside = np.arange(0, width, every) * PIXEL - BESIDE
+        across = np.array([-self.downhill[1], self.downhill[0]])
+        return np.asarray(down[:, None, None] * self.downhill + aside[:, None] * across)
+
+    def view_of(self, picture: Array, pose: Pose, lens: Lens) -> SingleFloats:
+        """Return the view of a frame (H, W): grey levels, NaN beyond its edge."""
+        import cv2
+
+        every = 10
+        points = self.points(every)
+        pixels = pose.pixels(points.reshape(-1, 2), lens).reshape(points.shape)
+        # Between points of a grid of 1 cm, the places of pixels are even to 0.01 px.
+        height, width = self.shape
+        rows, columns = np.mgrid[:height, :width].astype(np.float32) / every
+        maps = [
+            cv2.remap(
+                np.ascontiguousarray(pixels[..., axis], np.float32),
+                columns,
+                rows,
+                cv2.INTER_LINEAR,
+                borderMode=cv2.BORDER_REPLICATE,
+            )
+            for axis in (0, 1)
+        ]
+        view = cv2.remap(picture, maps[0], maps[1], cv2.INTER_LINEAR).astype(np.float32)
+        edge = picture.shape
+        inside = (maps[0] >= 0) & (maps[1] >= 0) & (maps[0] < edge[1] - 1) & (maps[1] < edge[0] - 1)
+        view[~inside] = np.nan
+        return np.asarray(view, dtype=np.float32)
+
+    def board(self) -> Array:
+        """Return which pixels show the board and its white border, (H, W)."""
+        half = np.array(SIZE) / 2 + GAP
+        return np.asarray((np.abs(self.points()) < half).all(axis=-1))
+
+
+@dataclass(frozen=True)
+class Slide:
+    """How far the cloth has slid."""
+
+    times: Floats
+    """Of frames from the level tray on, up to where the cloth leaves the reach, (N,) [s]."""
+    offsets: Floats
+    """Down the slope, (N,) [m on a sheet of true size]."""
+    patches: int
+    """Number of patches of cloth."""
+    together: float
+    """Share of patches that moved and moved together."""
+
+
+def mean_view(views: Sequence[SingleFloats]) -> SingleFloats:
+    """Return the mean of views (H, W): it has less noise than each of them."""
+    return np.asarray(np.mean(views, axis=0), dtype=np.float32)
+
+
+def patches_of(ground: Ground, level: SingleFloats) -> Array:
+    """Return the upper left pixels (row, column) of patches with contrast, (P, 2)."""
+    height, width = level.shape
+    hidden = ground.board() | np.isnan(level)
+    slope = np.abs(np.gradient(np.nan_to_num(level), axis=0))
+    corners = []
+    for row in range(BACK, height - PATCH - REACH, PATCH_STEP):
+        for column in range(BACK, width - PATCH - BACK, PATCH_STEP):
+            window = (slice(row, row + PATCH), slice(column, column + PATCH))
+            if not hidden[window].any() and slope[window].mean() > CONTRAST_MIN:
+                corners.append((row, column))
+    return np.array(corners, dtype=np.int64).reshape(-1, 2)
+
+
+def correlations(level: SingleFloats, view: Array, patches: Array) -> SingleFloats:
+    """Return the correlation of patches with a view, (P, S, A), at shifts down the slope and aside.
+
+    The first shift down is -`BACK`, and that aside is the negative of its half.
+    """
+    import cv2
+
+    side = BACK // 2
+    still = np.clip(np.nan_to_num(level) + 0.5, 0, 255).astype(np.uint8)
+    rows = []
+    for row, column in patches:
+        template = still[row : row + PATCH, column : column + PATCH]
+        strip = view[row - BACK : row + PATCH + REACH, column - side : column + PATCH + side]
+        rows.append(cv2.matchTemplate(strip, template, cv2.TM_CCOEFF_NORMED))
+    shape = (len(patches), BACK + REACH + 1, 2 * side + 1)
+    return np.array(rows, dtype=np.float32).reshape(shape)
+
+
+def _shift(curve: SingleFloats, near: float, step: int) -> float:
+    """Return the shift of the best match near another shift, to parts of a pixel [px]."""
+    middle = round(near) + BACK
+    low = max(0, middle - step)
+    high = min(len(curve), middle + step + 1)
+    best = low + int(np.argmax(curve[low:high]))
+    inner = min(max(best, 1), len(curve) - 2)
+    left, top, right = curve[inner - 1 : inner + 2]
+    bend = left - 2 * top + right
+    part = 0.5 * (left - right) / bend if bend < -1e-9 else 0.0
+    return inner - BACK + float(np.clip(part, -1.0, 1.0))
+
+
+def _moved(matches: SingleFloats) -> Array:
+    """Return the shift of each patch that has clearly moved, and 0 of others, (P,) [px]."""
+    best = matches.argmax(axis=1)
+    top = matches.max(axis=1)
+    still = matches[:, BACK - 2 : BACK + 3].max(axis=1)
+    clear = (top > MATCH_MIN) & (top > still + GAIN_MIN)
+    return np.where(clear & (best - BACK >= MOVED), best - BACK, 0)
+
+
+def _still(matches: SingleFloats) -> Array:
+    """Return which patches have clearly stayed, (P,)."""
+    best = matches.argmax(axis=1)
+    return np.asarray((np.abs(best - BACK) <= STAYS) & (matches.max(axis=1) > STILL_MIN))
+
+
+def _cloth(matches: SingleFloats) -> Array:
+    """Return which patches have moved together in a frame, (P,)."""
+    shifts = _moved(matches)
+    moving = shifts[shifts > 0]
+    if len(moving) < CLOTH_MIN:
+        return np.zeros(len(shifts), dtype=bool)
+    return np.asarray((shifts > 0) & (np.abs(shifts - np.median(moving)) <= TOGETHER))
+
+
+def slide_of(
+    times: Floats,
+    tilts: Floats,
+    views: Sequence[Array],
+    ground: Ground,
+    level: SingleFloats,
+) -> Slide | None:
+    """Return how far the cloth has slid, or None if nothing slides.
+
+    Args:
+        times: Of frames from the level tray to the steepest one, (N,) [s].
+        tilts: Of the tray, (N,) [rad].
+        views: The views of these frames, grey levels (H, W).
+        ground: The view.
+        level: The view of the level tray, without noise; NaN beyond the frame.
+    """
+    patches = patches_of(ground, level)
+    every = max(1, round(1.0 / (LOOKS * float(np.median(np.diff(times))))))
+    before = np.zeros(len(patches), dtype=bool)
+    # A pattern with a period lies on itself from time to time: the tray stays at every look.
+    stayed = np.ones(len(patches), dtype=bool)
+    for frame in range(0, len(times), every):
+        matches = correlations(level, views[frame], patches).max(axis=2)
+        if tilts[frame] < STILL_TILT:
+            stays = matches[:, BACK - 2 : BACK + 3].max(axis=1, initial=-1.0) > STILL_MIN
+            patches, matches = patches[stays], matches[stays]
+            before, stayed = before[stays], stayed[stays]
+        stayed &= _still(matches)
+        moving = _cloth(matches)
+        # Only what has moved in two looks is no chance match.
+        cloth = moving & before
+        if cloth.sum() >= CLOTH_MIN:
+            first = int(np.searchsorted(times, times[frame] - BEFORE))
+            share = float(moving.sum() / (_moved(matches) > 0).sum())
+            used = slice(first, frame + 1)
+            offsets = _path(views[used], level, patches[cloth])
+            if stayed.sum() >= CLOTH_MIN:
+                # What poses are off by moves the tray's own texture alike.
+                tray = patches[stayed][:: 1 + int(stayed.sum()) // TRAY_MAX]
+                offsets = offsets - _path(views[used], level, tray, BACK // 2)
+            return Slide(times[used], offsets, int(cloth.sum()), share)
+        before = moving
+    return None
+
+
+def _path(
+    views: Sequence[Array], level: SingleFloats, patches: Array, step: int = STEP_MAX
+) -> Floats:
+    """Return the common shift of patches in each view, (N,) [m]: up to `step` px from the last."""
+    offsets = []
+    near = 0.0
+    for view in views:
+        # All shift aside alike: a striped patch alone may slip along its stripes.
+        together = correlations(level, view, patches).mean(axis=0).max(axis=1)
+        near = _shift(together, near, step)
+        offsets.append(near)
+    return PIXEL * np.array(offsets)
