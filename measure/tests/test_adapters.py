@@ -30,6 +30,9 @@ LONGEST = 90
 WITH_SHARED = 127
 """Most of an adapter together with the file that both adapters of Newton share."""
 
+BUDGET = 60.0
+"""CPU time of a cell [s]."""
+
 CHEAPEST = {"elastica": "hanging-rod"}
 """The experiment of each adapter that costs least, if it is not the sliding patch."""
 
@@ -86,11 +89,13 @@ def test_the_cheapest_experiment_runs(name: str, tmp_path: Path) -> None:
     cells: list[Cell] = []
     experiment = CHEAPEST.get(name, "kinetic-friction")
     program = Program(FOLDER / f"{name}.py", str(python))
-    measure(Request(program, tmp_path, (experiment,), ("default",)), cells.append)
-    results = [cell for cell in cells if cell.experiment == experiment]
-    states = {cell.state for cell in results}
-    # Right or wrong, the adapter sets the scene up and steps.
-    assert states <= {"measured", "no value", "sleeps"}, [cell.reason for cell in results]
+    request = Request(program, tmp_path, (experiment,), ("default",), budget=BUDGET)
+    measure(request, cells.append)
+    coarsest, *finer = (cell for cell in cells if cell.experiment == experiment)
+    # Right or wrong, the adapter sets the scene up and steps. Finer meshes may need more time.
+    answers = {"measured", "no value", "sleeps"}
+    assert coarsest.state in answers, coarsest.reason
+    assert {cell.state for cell in finer} <= answers | {"not finished", "not run"}
 
 
 MESH = meshes.grid(0.1, 0.1, 4, 4)

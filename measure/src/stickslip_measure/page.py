@@ -83,12 +83,23 @@ def chosen(rows: Mapping[Row, Sequence[Cell]]) -> Iterator[Experiment]:
             yield experiment
 
 
-def at_default(cells: Sequence[Cell], experiment: Experiment) -> Cell | None:
-    """Return the cell of the default resolution, if it was measured."""
-    for cell in cells:
-        if cell.experiment == experiment.name and cell.cells == experiment.default:
-            return cell
-    return None
+def representative(cells: Sequence[Cell], experiment: Experiment) -> Cell | None:
+    """Return the cell that stands for an experiment: of the default resolution, if it has a value.
+
+    Otherwise it is the finest of the coarser ones that have a value, or else the coarsest, whose
+    reason says more than that of a cell that was not run.
+    """
+    at_most = sorted(
+        (c for c in cells if c.experiment == experiment.name and c.cells <= experiment.default),
+        key=lambda cell: cell.cells,
+    )
+    measured = [cell for cell in at_most if cell.state == MEASURED]
+    return next(iter([*measured[::-1], *at_most]), None)
+
+
+def bracketed(text: str, cell: Cell, experiment: Experiment) -> str:
+    """Return a text in brackets if its cell is coarser than the default resolution."""
+    return text if cell.cells == experiment.default else f"({text})"
 
 
 def overview(rows: Mapping[Row, Sequence[Cell]]) -> str:
@@ -114,7 +125,8 @@ def table_entry(name: str, mark: str, content: str, reason: str = "") -> str:
 
 def verdict(cells: Sequence[Cell]) -> str:
     """Return whether cloth holds at 90 % of the angle of slip, as an entry of the table."""
-    cell = at_default(cells, experiments.EXPERIMENTS["creep"])
+    creep = experiments.EXPERIMENTS["creep"]
+    cell = representative(cells, creep)
     if cell is None:
         return table_entry("verdict", "none", "not asked")
     if cell.value is None:
@@ -122,18 +134,19 @@ def verdict(cells: Sequence[Cell]) -> str:
         mark, word = ("poor", "sleeps") if cell.state == "sleeps" else ("none", "no answer")
         return table_entry("verdict", mark, word, cell.reason)
     if cell.value < CREEP:
-        return table_entry("verdict", "good", "holds")
-    return table_entry("verdict", "poor", "creeps")
+        return table_entry("verdict", "good", bracketed("holds", cell, creep))
+    return table_entry("verdict", "poor", bracketed("creeps", cell, creep))
 
 
 def entry(cells: Sequence[Cell], experiment: Experiment) -> str:
-    """Return the error at the default resolution, or the reason why there is none."""
-    cell = at_default(cells, experiment)
+    """Return the error, or the reason why there is none."""
+    cell = representative(cells, experiment)
     if cell is None:
         return table_entry(experiment.name, "absent", "–")
     if cell.state != MEASURED:
         return table_entry(experiment.name, "none", escape(cell.state), cell.reason)
-    return table_entry(experiment.name, grade(cell, experiment), error_text(cell, experiment))
+    text = bracketed(error_text(cell, experiment), cell, experiment)
+    return table_entry(experiment.name, grade(cell, experiment), text)
 
 
 def grade(cell: Cell, experiment: Experiment) -> str:
@@ -224,14 +237,14 @@ def number(value: float) -> str:
 
 
 def picture(experiment: Experiment, rows: Mapping[Row, Sequence[Cell]]) -> str:
-    """Return the curves of all rows at the default resolution, beside the closed form, as SVG."""
+    """Return the curves of all rows beside the closed form, as SVG."""
     # Text stays text, so that the page can be searched; a fixed salt gives the same file twice.
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": experiment.name, "font.size": 9}):
         figure = Figure(figsize=(6.2, 3.0), layout="constrained")
         axes = figure.subplots()
         drawn = 0
         for index, ((simulator, row), cells) in enumerate(rows.items()):
-            cell = at_default(cells, experiment)
+            cell = representative(cells, experiment)
             if cell is None or not cell.x:
                 continue
             # All rows have the same closed form, but for the frames of their steps.
@@ -239,7 +252,7 @@ def picture(experiment: Experiment, rows: Mapping[Row, Sequence[Cell]]) -> str:
                 axes.plot(cell.x, cell.reference, color="0.6", lw=4, label="closed form")
             style = STYLES[index // len(COLOURS) % len(STYLES)]
             colour = COLOURS[index % len(COLOURS)]
-            label = f"{simulator}, {row}"
+            label = bracketed(f"{simulator}, {row}", cell, experiment)
             marker = "." if len(cell.x) < 30 else ""
             axes.plot(cell.x, cell.measured, style, marker=marker, color=colour, label=label)
             drawn += 1
@@ -351,6 +364,7 @@ a { color: inherit; }
 <body>
 <h1>Who holds, and who creeps</h1>
 <p>Errors at the default resolution against closed forms: within 1 % green, within 5 % yellow.
+In brackets: of a coarser mesh, where the default one has no value.
 "Holds" is less than 0.1 mm in 10 s at 90 % of the angle of slip, awake. Made by
 stickslip-measure $version.</p>
 <table class="overview">
