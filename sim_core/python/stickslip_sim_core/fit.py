@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 
-from stickslip_sim_core.arrays import Floats
+from stickslip_sim_core.arrays import Floats, check_positive
 from stickslip_sim_core.cloth.presets import SolverSettings
 from stickslip_sim_core.scenes.family import SceneFamily
 from stickslip_sim_core.scenes.scene import ClothRun
@@ -109,6 +109,28 @@ class Observation(Protocol):
     def compare(self, run: ClothRun, derivatives: Sequence[Floats]) -> Compared:
         """Return the residual, and its derivatives from those of positions (frames, V, 3)."""
         ...
+
+
+@dataclass(frozen=True)
+class Prior:
+    """A normal distribution of the logarithm of a positive parameter, before the fit.
+
+    Raises:
+        ValueError: A number is not positive.
+    """
+
+    median: float
+    """In the unit of the parameter."""
+
+    deviation: float
+    """Standard deviation of the natural logarithm: 0.7 is a factor of 2."""
+
+    def __post_init__(self) -> None:
+        check_positive(median=self.median, deviation=self.deviation)
+
+    def compare(self, value: float) -> tuple[float, float]:
+        """Return the residual over the deviation, and its derivative by the value."""
+        return float(np.log(value / self.median)) / self.deviation, 1.0 / (value * self.deviation)
 
 
 class Minimum(NamedTuple):
@@ -210,6 +232,7 @@ def fit(
     *,
     start: Mapping[str, float] | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
+    priors: Mapping[str, Prior] | None = None,
     multistart: int = 3,
     seed: int = 0,
 ) -> Fit:
@@ -221,6 +244,8 @@ def fit(
         parameters: Names of the parameters to fit.
         start: Values to start from. Parameters without one start from the values of `scenes`.
         bounds: Least and largest value of some parameters; the others have the range of `scenes`.
+        priors: Distributions of some parameters before the fit. Each counts as one more
+            observation.
         multistart: Number of starts. Those after the first are drawn from the bounds, and are used
             while the observations are not explained by their noise.
         seed: Seed of the starts.
@@ -231,7 +256,7 @@ def fit(
             at each start a parameter has no effect or the run is not valid.
     """
     check_scipy()
-    search = _Search(scenes, observations, parameters, bounds or {})
+    search = _Search(scenes, observations, parameters, bounds or {}, priors or {})
     starts = search.starts(start or {}, multistart, seed)
     searches: list[Minimum] = []
     for values in starts:
@@ -309,22 +334,31 @@ class _Search:
         observations: Sequence[Observation],
         names: Sequence[str],
         bounds: Mapping[str, tuple[float, float]],
+        priors: Mapping[str, Prior],
     ) -> None:
         if not names:
             raise ValueError("parameters: must be at least one, got none")
         scenes.check_names(names)
-        for name in bounds:
-            if name not in names:
-                raise ValueError(f"bounds: must be of {', '.join(names)}, got {name!r}")
+        for argument, values in (("bounds", bounds), ("priors", priors)):
+            for name in values:
+                if name not in names:
+                    raise ValueError(f"{argument}: must be of {', '.join(names)}, got {name!r}")
         self._scenes, self._observations, self._names = scenes, observations, tuple(names)
-        self._count = sum(observation.count for observation in observations)
-        if self._count < len(names):
+        self._priors = priors
+        numbers = sum(observation.count for observation in observations)
+        if numbers < len(names):
             raise ValueError(
                 f"observations: must be at least as many numbers as parameters, {len(names)}, "
-                f"got {self._count}"
+                f"got {numbers}"
             )
+        self._count = numbers + len(priors)
         self._low, self._high = np.array([self._bounds(name, bounds) for name in names]).T
         self._is_log = self._low > 0.0
+        for name in priors:
+            if not self._is_log[self._names.index(name)]:
+                raise ValueError(
+                    f"priors: must be of parameters above 0, and {name} may be negative"
+                )
         # A search asks for the residual and then for the Jacobian of the same point.
         self._runs: dict[_Key, _Run] = {}
         self._count_of_runs = 0
@@ -502,7 +536,7 @@ class _Search:
         if not finer.valid:
             return np.full(len(self._names), np.nan)
         now = self._minima[tuple(minimum.values.values())]
-        change = self._compared(finer, []).residual - now.residual
+        change = self._compared(finer, [], minimum.values).residual - now.residual
         J = now.jacobian
         return np.asarray(-STEPS_SHARE * np.linalg.pinv(J.T @ J) @ (J.T @ change))
 
@@ -529,16 +563,30 @@ class _Search:
             return _Run(none[:, 0], none, run.reason, run.step_ends)
         if not np.isfinite(derivatives).all():
             return _Run(none[:, 0], none, "the derivatives could not be solved", run.step_ends)
-        return _Run(*self._compared(run, derivatives), "", run.step_ends)
+        return _Run(*self._compared(run, derivatives, values), "", run.step_ends)
 
-    def _compared(self, run: ClothRun, derivatives: Sequence[Floats]) -> Compared:
+    def _compared(
+        self, run: ClothRun, derivatives: Sequence[Floats], values: Mapping[str, float]
+    ) -> Compared:
+        """Return a run with these values compared with all observations, and then the priors."""
         for observation in self._observations:
             observation.check(run)
         parts = [observation.compare(run, derivatives) for observation in self._observations]
+        parts += [
+            self._compared_with_prior(name, values[name], len(derivatives)) for name in self._priors
+        ]
         return Compared(
             np.concatenate([part.residual for part in parts]),
             np.concatenate([part.jacobian for part in parts]),
         )
+
+    def _compared_with_prior(self, name: str, value: float, derivatives: int) -> Compared:
+        residual, rate = self._priors[name].compare(value)
+        by = np.zeros((1, derivatives))
+        # A run without derivatives has a residual alone.
+        if derivatives:
+            by[0, self._names.index(name)] = rate
+        return Compared(np.array([residual]), by)
 
 
 def _finer(settings: SolverSettings) -> SolverSettings:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from stickslip_sim_core.arrays import Floats, check_positive
 from stickslip_sim_core.fit import Compared, check_observed
@@ -12,6 +12,9 @@ from stickslip_sim_core.scenes.scene import ClothRun
 
 OUTLINE_STEP = 1e-3
 """Distance beside an edge, over its length, at which the picture must be empty for an outline."""
+
+PIXEL_NOISE = 12.0**-0.5
+"""Standard deviation of a place that is known to one pixel, evenly within it [px]."""
 
 
 def check_frames(frames: Sequence[int], vertices: NDArray[np.intp], run: ClothRun) -> None:
@@ -92,6 +95,30 @@ class View:
     def __post_init__(self) -> None:
         check_observed("matrix", np.asarray(self.matrix, float), (3, 4))
 
+    @staticmethod
+    def of_camera(
+        *,
+        fx: float,
+        fy: float,
+        cx: float,
+        cy: float,
+        rotation: ArrayLike,
+        translation: ArrayLike,
+    ) -> "View":
+        """Return the view of a camera without lens distortion, as manifests of datasets have it.
+
+        Args:
+            fx: Focal length along a row [px].
+            fy: Focal length along a column [px].
+            cx: Column of the principal point [px].
+            cy: Row of the principal point [px].
+            rotation: R from the world to the camera: (3, 3).
+            translation: t [m]: (3,).
+        """
+        intrinsic = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        pose = np.column_stack([np.asarray(rotation, float), np.asarray(translation, float)])
+        return View(intrinsic @ pose)
+
     def project(self, points: Floats) -> Floats:
         """Return the pixels of points (..., 3) [m]: (..., 2)."""
         homogeneous = points @ self.matrix[:, :3].T + self.matrix[:, 3]
@@ -166,6 +193,45 @@ class Silhouettes:
     view: View
     noise: float
     """Standard deviation of the distance [px]."""
+
+    @staticmethod
+    def of_masks(
+        frames: Sequence[int],
+        masks: NDArray[np.bool_],
+        view: View,
+        *,
+        hidden: NDArray[np.bool_] | None = None,
+        noise: float = PIXEL_NOISE,
+    ) -> "Silhouettes":
+        """Return the silhouettes of pictures in which each pixel is cloth or not.
+
+        Args:
+            frames: Numbers of frames: (T,).
+            masks: Pixels whose middle shows cloth: (T, height, width).
+            view: Camera of the pictures.
+            hidden: Pixels before which something else may hide cloth, as `masks`. None: no pixel.
+            noise: Standard deviation of the distance [px].
+
+        Raises:
+            ValueError: An argument breaks its rule, or a picture has no outline of cloth.
+        """
+        if hidden is None:
+            hidden = np.zeros_like(masks)
+        for name, pictures in (("masks", masks), ("hidden", hidden)):
+            is_right = pictures.dtype == bool and pictures.ndim == 3
+            if not is_right or len(pictures) != len(frames) or pictures.shape != masks.shape:
+                raise ValueError(
+                    f"{name}: must be booleans (frame, height, width) of {len(frames)} frames, "
+                    f"got {pictures.dtype} {pictures.shape}"
+                )
+        outlines = [mask_outline(*pair) for pair in zip(masks, hidden, strict=True)]
+        for frame, points in zip(frames, outlines, strict=True):
+            if not len(points):
+                raise ValueError(
+                    f"masks: must show an outline of cloth in each frame, and do not in frame "
+                    f"{frame}"
+                )
+        return Silhouettes(frames, outlines, view, noise)
 
     def __post_init__(self) -> None:
         check_positive(noise=self.noise)
@@ -246,8 +312,7 @@ def outline(pixels: Floats, triangles: NDArray[np.int32]) -> tuple[NDArray[np.in
         pixels: Projected vertices (V, 2) [px].
         triangles: Vertices of the triangles (T, 3).
     """
-    pairs = np.concatenate([triangles[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
-    edges = np.unique(np.sort(pairs, axis=1), axis=0).astype(np.intp)
+    edges = _rims(pixels, triangles)
     along = pixels[edges[:, 1]] - pixels[edges[:, 0]]
     length = np.linalg.norm(along, axis=1, keepdims=True)
     edges, along, length = (part[length[:, 0] > 0.0] for part in (edges, along, length))
@@ -260,6 +325,40 @@ def outline(pixels: Floats, triangles: NDArray[np.int32]) -> tuple[NDArray[np.in
     is_outline = is_right != is_left
     normals = np.where(is_right[:, None], across, -across)
     return edges[is_outline], normals[is_outline]
+
+
+def _rims(pixels: Floats, triangles: NDArray[np.int32]) -> NDArray[np.intp]:
+    """Return the edges (E, 2) whose own triangles all lie on one side in the picture.
+
+    Any other edge has cloth on both sides, and is no part of an outline.
+    """
+    corners = np.concatenate([triangles[:, order] for order in ([0, 1, 2], [1, 2, 0], [2, 0, 1])])
+    ends = np.sort(corners[:, :2], axis=1)
+    edges, number = np.unique(ends, axis=0, return_inverse=True)
+    along = pixels[ends[:, 1]] - pixels[ends[:, 0]]
+    across = pixels[corners[:, 2]] - pixels[ends[:, 0]]
+    is_left = along[:, 0] * across[:, 1] > along[:, 1] * across[:, 0]
+    count = np.bincount(number.ravel(), minlength=len(edges))
+    left = np.bincount(number.ravel(), weights=is_left, minlength=len(edges))
+    return np.asarray(edges[(left == 0) | (left == count)], dtype=np.intp)
+
+
+def mask_outline(mask: NDArray[np.bool_], hidden: NDArray[np.bool_]) -> Floats:
+    """Return points on the outline of a mask (height, width): (N, 2) [px].
+
+    A point is halfway between the middles of two neighbours in a row or a column, one of cloth and
+    one not. Neighbours that are hidden have none, and neither has the border of the picture.
+    """
+    rows, columns = np.mgrid[: mask.shape[0], : mask.shape[1]]
+    middles = np.stack([columns, rows], axis=-1).astype(float)
+    points = []
+    for before, after in (
+        (np.s_[:, :-1], np.s_[:, 1:]),
+        (np.s_[:-1, :], np.s_[1:, :]),
+    ):
+        is_outline = (mask[before] != mask[after]) & ~hidden[before] & ~hidden[after]
+        points.append(0.5 * (middles[before][is_outline] + middles[after][is_outline]))
+    return np.concatenate(points)
 
 
 def _covered(points: Floats, pixels: Floats, triangles: NDArray[np.int32]) -> NDArray[np.bool_]:

@@ -15,8 +15,15 @@ from stickslip_sim_core.cloth.contact import plane
 from stickslip_sim_core.cloth.fabrics import fabric
 from stickslip_sim_core.cloth.presets import preset_named
 from stickslip_sim_core.cloth.solver import GRAVITY
-from stickslip_sim_core.fit import Compared, Observation, fit
-from stickslip_sim_core.observations import MarkedPixels, Silhouettes, Vertices, View, outline
+from stickslip_sim_core.fit import Compared, Observation, Prior, fit
+from stickslip_sim_core.observations import (
+    MarkedPixels,
+    Silhouettes,
+    Vertices,
+    View,
+    mask_outline,
+    outline,
+)
 from stickslip_sim_core.scenes.family import SceneFamily, SceneParameter
 from stickslip_sim_core.scenes.holders import Hang
 from stickslip_sim_core.scenes.scene import ClothRun, Scene
@@ -31,6 +38,8 @@ VIEW = View(
     np.array([[500.0, 0.0, -100.0, 100.0], [0.0, 500.0, -100.0, 100.0], [0.0, 0.0, -1.0, 1.0]])
 )
 """Looks at the cloth along -z from 1 m above it."""
+TURN_MIDDLE = np.array([100.0, 100.0])
+"""Pixel about which the camera of masks is turned."""
 
 
 def sliding_sheet(values: Mapping[str, float], _hang: Hang) -> Scene:
@@ -85,6 +94,25 @@ def silhouettes(run: ClothRun) -> Silhouettes:
     return Silhouettes(FRAMES, outlines, VIEW, 0.05)
 
 
+def masks(run: ClothRun) -> Silhouettes:
+    """Return the silhouettes of pictures of the flat sheet, by the middles of their pixels.
+
+    The camera is turned, so that edges cross rows of pixels at all places.
+    """
+    turn = np.eye(3)
+    turn[:2, :2] = [[np.cos(0.35), -np.sin(0.35)], [np.sin(0.35), np.cos(0.35)]]
+    turn[:2, 2] = TURN_MIDDLE - turn[:2, :2] @ TURN_MIDDLE
+    rows, columns = np.mgrid[:200, :200]
+    upright = np.stack([columns, rows], axis=-1) - TURN_MIDDLE
+    upright = upright @ turn[:2, :2] + TURN_MIDDLE
+    pictures = []
+    for frame in FRAMES:
+        projected = VIEW.project(run.positions[frame])
+        low, high = projected.min(axis=0), projected.max(axis=0)
+        pictures.append(((upright > low) & (upright < high)).all(axis=-1))
+    return Silhouettes.of_masks(FRAMES, np.stack(pictures), View(turn @ VIEW.matrix))
+
+
 @pytest.mark.parametrize("observe", [vertices, pixels, silhouettes])
 def test_parameters_are_found(scenes: SceneFamily, run: ClothRun, observe: Any) -> None:
     answer = fit(scenes, [observe(run)], ["mu"])
@@ -93,6 +121,90 @@ def test_parameters_are_found(scenes: SceneFamily, run: ClothRun, observe: Any) 
     assert answer.warning == ""
     assert 0.5 < answer.mean_square < 1.5
     assert answer.runs <= 8
+
+
+def test_friction_is_found_from_masks(scenes: SceneFamily, run: ClothRun) -> None:
+    answer = fit(scenes, [masks(run)], ["mu"])
+    pixels_by_mu = VIEW.project_change(
+        run.positions[-1], scenes.differentiated(["mu"]).run().sensitivities["mu"].positions[-1]
+    )
+    assert abs(answer.values["mu"] - TRUTH["mu"]) < 0.1 / np.abs(pixels_by_mu).max()
+    assert answer.warning == ""
+
+
+def test_an_outline_of_a_mask_is_between_pixels_that_show_what_they_do() -> None:
+    mask = np.zeros((6, 8), bool)
+    mask[2:4, 3:8] = True
+    hidden = np.zeros_like(mask)
+    hidden[1, 4] = True
+    points = mask_outline(mask, hidden).tolist()
+    # The border of the picture at column 7, and the hidden pixel above (4, 2), are no outline.
+    across = [[2.5, row] for row in (2, 3)]
+    above = [[column, 1.5] for column in (3, 5, 6, 7)]
+    below = [[column, 3.5] for column in (3, 4, 5, 6, 7)]
+    assert sorted(points) == sorted(across + above + below)
+
+
+def test_outline_of_a_folded_sheet_bounds_all_of_it(run: ClothRun) -> None:
+    # The right half lies on the left one, and sticks out below it by 1 px.
+    folded = VIEW.project(run.positions[0])
+    middle = folded[:, 0].mean()
+    is_right = folded[:, 0] > middle + 1e-6
+    folded[is_right] = np.array([2.0 * middle, 1.0]) + folded[is_right] * [-1.0, 1.0]
+    edges, normals = outline(folded, run.triangles)
+    ends = folded[edges]
+    low, high = folded.min(axis=0), folded.max(axis=0)
+    is_lowest = (ends[:, :, 1] > high[1] - 1e-6).all(axis=1)
+    assert normals[is_lowest] == pytest.approx(np.tile([0.0, 1.0], (is_lowest.sum(), 1)))
+    # The fold and the free edge on it bound the picture on both sides.
+    assert ends[:, :, 0].min() == pytest.approx(low[0])
+    assert ends[:, :, 0].max() == pytest.approx(high[0])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"masks": np.zeros((3, 4, 4))}, "masks: must be booleans .* of 3 frames, got float64"),
+        ({"masks": np.zeros((2, 4, 4), bool)}, "masks: must be booleans .* of 3 frames"),
+        ({"hidden": np.zeros((3, 4, 5), bool)}, "hidden: must be booleans"),
+        ({}, "masks: must show an outline of cloth in each frame, and do not in frame 2"),
+    ],
+)
+def test_wrong_masks_are_refused(changes: dict[str, Any], message: str) -> None:
+    arguments = {"masks": np.zeros((3, 4, 4), bool), "view": VIEW, **changes}
+    with pytest.raises(ValueError, match=message):
+        Silhouettes.of_masks(FRAMES, **arguments)
+
+
+def test_a_view_of_a_camera_projects_as_its_numbers_say() -> None:
+    view = View.of_camera(
+        fx=100.0,
+        fy=200.0,
+        cx=10.0,
+        cy=20.0,
+        rotation=[[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]],
+        translation=[0.0, 0.0, 2.0],
+    )
+    assert view.project(np.array([0.5, 0.25, 0.0])) == pytest.approx([22.5, -30.0])
+
+
+def test_a_prior_weighs_as_an_observation(scenes: SceneFamily, run: ClothRun) -> None:
+    observation = vertices(run)
+    alone = fit(scenes, [observation], ["mu"])
+    # A prior as narrow as the answer is uncertain, and 4 of its deviations off.
+    width = alone.by_noise["mu"] / alone.values["mu"]
+    median = alone.values["mu"] * float(np.exp(4.0 * width))
+    both = fit(scenes, [observation], ["mu"], priors={"mu": Prior(median, width)})
+    middle = 0.5 * (alone.values["mu"] + median)
+    assert both.values["mu"] == pytest.approx(middle, abs=0.2 * alone.by_noise["mu"])
+    assert both.by_noise["mu"] == pytest.approx(alone.by_noise["mu"] / 2.0**0.5, rel=0.2)
+
+
+def test_a_prior_holds_what_is_not_seen(scenes: SceneFamily, run: ClothRun) -> None:
+    answer = fit(scenes, [vertices(run)], ["mu", "bending"], priors={"bending": Prior(2.0, 0.5)})
+    assert answer.values["bending"] == pytest.approx(2.0, rel=0.05)
+    assert answer.deviations["bending"] == pytest.approx(1.0, rel=0.1)
+    assert abs(answer.values["mu"] - TRUTH["mu"]) < 4.0 * answer.deviations["mu"]
 
 
 @pytest.mark.parametrize("observe", [vertices, pixels, silhouettes])
@@ -219,6 +331,7 @@ def damped(scenes: SceneFamily, step: float) -> SceneFamily:
         ({"multistart": 0}, "multistart: must be 1 or more"),
         ({"start": {"mu": 20.0}}, r"mu: must be within 0 \.\.\. 0\.4"),
         ({"bounds": {"density": (0.5, 2.0)}}, "bounds: must be of mu"),
+        ({"priors": {"density": Prior(1.0, 0.5)}}, "priors: must be of mu"),
         ({"bounds": {"mu": (0.3, 0.2)}}, "bounds: of mu must ascend"),
         ({"bounds": {"mu": (0.3, 0.4)}, "start": {"mu": 0.2}}, "start: must be within the bounds"),
     ],
@@ -230,6 +343,12 @@ def test_wrong_arguments_are_refused(
     names = arguments.pop("parameters")
     with pytest.raises(ValueError, match=message):
         fit(scenes, [vertices(run)], names, **arguments)
+
+
+@pytest.mark.parametrize("numbers", [(0.0, 1.0), (1.0, 0.0), (-1.0, 1.0), (1.0, np.nan)])
+def test_priors_without_positive_numbers_are_refused(numbers: tuple[float, float]) -> None:
+    with pytest.raises(ValueError, match=r"median|deviation"):
+        Prior(*numbers)
 
 
 def test_fewer_observations_than_parameters_are_refused(scenes: SceneFamily) -> None:

@@ -1,4 +1,4 @@
-"""The command that fits parameters of a scene to observed vertices."""
+"""The command that fits parameters of a scene to vertices or silhouettes that were seen."""
 
 from pathlib import Path
 
@@ -45,10 +45,12 @@ def fit(
     seed: int,
     as_json: bool,
 ) -> None:
-    """Fit parameters of a scene to vertices that were seen, by exact derivatives of its runs.
+    """Fit parameters of a scene to observations of it, by exact derivatives of its runs.
 
     FILE has `frames` (T), `noise` [m] and `SHEET.positions` (T, K, 3) [m], with `SHEET.vertices`
-    (K) unless all were seen. Exits with 1 if noise does not explain the observations.
+    (K) unless all were seen; or silhouettes, `CAMERA.masks` (T, h, w) and `CAMERA.matrix` (3, 4),
+    with `CAMERA.hidden` where something may hide cloth and `pixel_noise` [px]. Exits with 1
+    if noise does not explain the observations.
     """
     document, files = find_scene(scene)
     refuse_impossible_start(scene, spec_of(document), files)

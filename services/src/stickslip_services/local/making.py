@@ -162,7 +162,7 @@ def preview(scene: Scene, files: Mapping[str, bytes], out: Path) -> list[str]:
 def fit(
     scene: Scene, files: Mapping[str, bytes], observations: Path, request: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Fit parameters of a scene to observed vertices; raise CommandError.
+    """Fit parameters of a scene to observations of it; raise CommandError.
 
     `observations` is an NPZ file, and `request` has the options of the workers' program.
     """
