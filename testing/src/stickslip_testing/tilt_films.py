@@ -119,7 +119,7 @@ class Take:
     elevation: float = 40.0
     """Of the camera [degree]."""
     margin: float = 0.08
-    """Least distance of what is filmed from the edge of the frame, over its size."""
+    """Least distance of things from the edge of the frame, over its size."""
     shake: float = 1.0
     """Of the phone: 1 is a hand that moves it by 6 mm and 0.4 degrees."""
     readout: float = 0.015

@@ -35,9 +35,10 @@ def answer_of(film: Film, drag: Drag) -> dict[str, Any]:
 def nothing_slides(film: Film) -> str:
     """Return what a film says in which the cloth stays."""
     return (
-        f"the cloth must slide, and does not up to a tilt of {np.degrees(film.steepest):.1f} "
-        f"degrees: mu is above {math.tan(film.steepest):.2f}; tilt the tray further, or lay the "
-        "cloth between the board and the lower edge of the tray"
+        "the cloth must slide, and no slide was detected up to a tilt of "
+        f"{np.degrees(film.steepest):.1f} degrees. If it stayed, mu is above "
+        f"{math.tan(film.steepest):.2f}: tilt the tray further. If it slid, film it nearer and "
+        "brighter, between the board and the lower edge of the tray"
     )
 
 

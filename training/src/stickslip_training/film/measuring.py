@@ -33,7 +33,7 @@ STEEP = np.radians(5.0)
 AFTER_PEAK = 0.2
 """Time after the steepest frame that is looked at [s]: the cloth may begin to slide there."""
 BOARD_SD = np.radians(0.2)
-"""Standard deviation of a board's normal besides noise, by lens, shutter and print [rad]: what was
+"""Standard deviation of a board's normal besides noise, by lens, shutter and print [rad]: the error
 left in seven rendered films that judge nothing."""
 TILT_SD_MAX = np.radians(1.0)
 """Largest standard deviation of a tilt that is an answer [rad]: 0.02 to 0.035 in mu."""
@@ -119,7 +119,7 @@ def measure_film(path: Path, *, focal: float | None = None, level_sd: float = 0.
         level_sd: Standard deviation of the table's slope [degree].
 
     Raises:
-        FilmError: The film does not show what is needed.
+        FilmError: The film lacks boards, tilt or a clear slide.
         VideoError: The file is no film.
     """
     sightings = _look(path)
