@@ -157,14 +157,26 @@ def slid(edges, shifts):
 
 def test_a_cloth_that_slides_is_followed_and_creeping_edges_are_no_slide():
     shifts = np.array([0] * 30 + [1, 2, 4, 6, 9, 12, 16, 20, 25, 30])
-    slide = slid(np.zeros(40, int), shifts)
+    moving = slid(np.zeros(40, int), shifts)
+    slide = moving.slide
     assert slide is not None
+    assert not moving.stayed
     frames = np.round(slide.times * 30).astype(int)
     assert slide.offsets == pytest.approx(PIXEL * shifts[frames], abs=5e-4)
     assert slide.together > 0.8
-    assert slid(np.minimum(np.arange(40) // 2, 15), np.zeros(40, int)) is None
-    assert slid(np.zeros(40, int), np.zeros(40, int)) is None
+    assert slid(np.minimum(np.arange(40) // 2, 15), np.zeros(40, int)).slide is None
     assert shifts.max() < REACH
+
+
+def test_a_cloth_stays_only_if_it_is_seen_at_its_place():
+    resting = slid(np.zeros(40, int), np.zeros(40, int))
+    assert resting.slide is None
+    assert resting.stayed
+    # It jumps beyond the reach, so no slide is seen.
+    gone = slid(np.zeros(40, int), np.array([0] * 30 + [REACH + 60] * 10))
+    assert gone.slide is None
+    assert gone.left > 0.5 * gone.patches
+    assert not gone.stayed
 
 
 def test_a_frame_whose_pose_is_the_other_one_is_left_out():

@@ -33,12 +33,19 @@ def answer_of(film: Film, drag: Drag) -> dict[str, Any]:
 
 
 def nothing_slides(film: Film) -> str:
-    """Return what a film says in which the cloth stays."""
+    """Return what a film says in which no slide was seen: the cloth stayed, or was not followed."""
+    steepest = f"{np.degrees(film.steepest):.1f} degrees"
+    motion = film.motion
+    if motion.stayed:
+        return (
+            f"the cloth must slide, and stays up to a tilt of {steepest}, so mu is above "
+            f"{math.tan(film.steepest):.2f}; tilt the tray further"
+        )
     return (
-        "the cloth must slide, and no slide was detected up to a tilt of "
-        f"{np.degrees(film.steepest):.1f} degrees. If it stayed, mu is above "
-        f"{math.tan(film.steepest):.2f}: tilt the tray further. If it slid, film it nearer and "
-        "brighter, between the board and the lower edge of the tray"
+        f"the cloth must be seen to slide or to stay. Up to a tilt of {steepest} no slide was seen "
+        f"and {motion.left} of {motion.patches} patches of the tray have left their place; film "
+        "it nearer and brighter, between the board and the lower edge of the tray, and keep hands "
+        "off the tray"
     )
 
 
@@ -89,6 +96,8 @@ def _slip(slip: Slip) -> dict[str, Any]:
 
 
 def _mu(film: Film) -> dict[str, float | None] | None:
+    if film.slip is None and not film.motion.stayed:
+        return None
     if film.slip is None:
         return {"median": None, "low": None, "high": None, "above": math.tan(film.steepest)}
     low, high = film.slip.interval

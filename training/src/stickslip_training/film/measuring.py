@@ -13,7 +13,7 @@ from stickslip_training.cloth.video import VideoError, read_frames
 from stickslip_training.film.boards import BOARDS, Finder, Sight
 from stickslip_training.film.onset import Onset, clear_motion, growth, onset_of
 from stickslip_training.film.poses import Lens, calibrated
-from stickslip_training.film.sliding import Ground, Slide, mean_view, slide_of
+from stickslip_training.film.sliding import Ground, Motion, Slide, mean_view, slide_of
 from stickslip_training.film.tilt import TiltAt, Tilts, tilt_at, tilts_of
 
 KEY_FRAMES = 24
@@ -103,9 +103,11 @@ class Film:
     downhill: Floats
     """Direction of the slope on the tray's board, (2,)."""
     slip: Slip | None
-    """None: nothing slides."""
+    """None: no slide was seen."""
+    motion: Motion
+    """What moved on the tray."""
     steepest: float
-    """Largest tilt [rad]: where nothing slides, mu is above its tangent."""
+    """Largest tilt [rad]: where the cloth stayed, mu is above its tangent."""
     level_again: float | None
     """Time at which the tray lies level again [s]; None: it never does."""
 
@@ -134,7 +136,8 @@ def measure_film(path: Path, *, focal: float | None = None, level_sd: float = 0.
             "until the cloth slides"
         )
     ground = Ground(_downhill(tilts, peak))
-    slide = _slide(path, tilts, peak, ground, lens)
+    motion = _motion(path, tilts, peak, ground, lens)
+    slide = motion.slide
     slip = None
     if slide is not None:
         near = tilt_at(tilts, float(slide.times[clear_motion(slide.offsets)]))
@@ -143,7 +146,7 @@ def measure_film(path: Path, *, focal: float | None = None, level_sd: float = 0.
     later = np.flatnonzero((tilts.angles < LEVEL) & (np.arange(len(tilts.angles)) > peak))
     again = float(tilts.times[later[0]]) if len(later) else None
     start = float(np.median(tilts.angles[: BOTH_MIN // 3]))
-    return Film(path, sightings, lens, tilts, start, ground.downhill, slip, steepest, again)
+    return Film(path, sightings, lens, tilts, start, ground.downhill, slip, motion, steepest, again)
 
 
 def _look(path: Path) -> Sightings:
@@ -199,8 +202,8 @@ def _downhill(tilts: Tilts, peak: int) -> Floats:
     return np.asarray(direction / np.hypot(*direction))
 
 
-def _slide(path: Path, tilts: Tilts, peak: int, ground: Ground, lens: Lens) -> Slide | None:
-    """Return how far the cloth slides while the tray is tilted; None if it does not."""
+def _motion(path: Path, tilts: Tilts, peak: int, ground: Ground, lens: Lens) -> Motion:
+    """Return what moves on the tray while it is tilted."""
     start = float(tilts.angles[:LEVEL_FRAMES].min())
     rising = int(np.argmax(tilts.angles[: peak + 1] > start + RISEN))
     count = min(LEVEL_FRAMES, max(1, rising))
@@ -209,14 +212,15 @@ def _slide(path: Path, tilts: Tilts, peak: int, ground: Ground, lens: Lens) -> S
     later = _views(path, tilts, ground, lens, last)
     first = list(islice(later, count))
     views = [_levels(view) for view in first] + [_levels(view) for view in later]
-    slide = slide_of(tilts.times[used], tilts.angles[used], views, ground, mean_view(first))
+    motion = slide_of(tilts.times[used], tilts.angles[used], views, ground, mean_view(first))
+    slide = motion.slide
     if slide is not None and slide.together < TOGETHER_MIN:
         raise FilmError(
             f"cloth: {TOGETHER_MIN:.0%} or more of what moves on the tray must move as one, and "
             f"{slide.together:.0%} does; lay the cloth flat, let it slide freely, and keep hands "
             "and other things off the tray"
         )
-    return slide
+    return motion
 
 
 def _views(

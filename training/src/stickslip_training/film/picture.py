@@ -113,10 +113,12 @@ def _draw_mu(axes: "Axes", film: Film, drag: Drag) -> None:
         mu = film.slip.mu
         axes.errorbar(0, mu, yerr=[[mu - low], [high - mu]], fmt="o", color="tab:blue", capsize=4)
         labels.append(f"tilt, static\n{mu:.3f}\n({low:.3f} to {high:.3f})")
-    else:
+    elif film.motion.stayed:
         above = float(np.tan(film.steepest))
         axes.errorbar(0, above, yerr=0.05, lolims=True, fmt="_", color="tab:blue")
         labels.append(f"tilt, static\nabove {above:.2f}")
+    else:
+        labels.append("tilt, static\nno answer")
     if drag.mu is not None:
         mu, low, high = (float(drag.mu[name]) for name in ("median", "low", "high"))
         axes.errorbar(1, mu, yerr=[[mu - low], [high - mu]], fmt="s", color="tab:red", capsize=4)
