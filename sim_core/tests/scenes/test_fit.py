@@ -1,7 +1,8 @@
 """Fits of a scene's parameters to noisy observations of a run, and what is refused."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -235,12 +236,15 @@ def test_derivatives_share_the_search_for_an_outline(
     assert len(searched) == len(FRAMES)
 
 
+@dataclass(frozen=True)
 class Jumping(Vertices):
     """Vertices whose residual jumps between near values, as steps of a solver make it."""
 
+    seed: int = 0
+
     def compare(self, run: ClothRun, derivatives: Sequence[Floats]) -> Compared:
         residual, by = super().compare(run, derivatives)
-        digits = int(1e12 * float(np.abs(run.positions).sum())) % 2**32
+        digits = (int(1e12 * float(np.abs(run.positions).sum())) + self.seed) % 2**32
         jumps = 0.05 * np.random.default_rng(digits).standard_normal(residual.shape)
         return Compared(residual + jumps, by)
 
@@ -249,12 +253,17 @@ def test_a_search_does_not_follow_jumps_within_the_noise(
     scenes: SceneFamily, run: ClothRun
 ) -> None:
     smooth = vertices(run)
-    answer = fit(scenes, [Jumping(FRAMES, smooth.positions, ALL, smooth.noise)], ["mu"])
-    assert answer.converged
-    assert answer.warning == ""
-    # A search that waits for a decrease of the residual takes 9 runs here.
-    assert answer.runs <= 8
-    assert abs(answer.values["mu"] - TRUTH["mu"]) < 4.0 * answer.deviations["mu"]
+    runs = []
+    for seed in range(5):
+        jumping = Jumping(FRAMES, smooth.positions, ALL, smooth.noise, seed)
+        answer = fit(scenes, [jumping], ["mu"])
+        runs.append(answer.runs)
+        assert answer.converged
+        assert answer.warning == ""
+        assert abs(answer.values["mu"] - TRUTH["mu"]) < 4.0 * answer.deviations["mu"]
+    # A jump may lead a search astray once. A search that waits for a decrease of the residual
+    # takes 9 runs.
+    assert median(runs) <= 8
 
 
 def test_runs_near_the_minimum_repeat_the_steps_of_one_run(
