@@ -151,7 +151,7 @@ def test_an_export_is_the_training_packages_work(
     )
     assert done.exit_code == 1
     assert "an export needs one of" in capfd.readouterr().err
-    monkeypatch.setattr("stickslip_services.cli.datasets.find_spec", lambda _name: None)
+    monkeypatch.setattr("stickslip_services.cli.passed_on.find_spec", lambda _name: None)
     done = run("export", dataset, "--webdataset", tmp_path / "out", "--url", url)
     assert (done.exit_code, "pip install ./schemas './training[export]'" in done.stderr) == (
         1,

@@ -1,10 +1,7 @@
 """Commands for datasets: list, pull, export, sign and verify."""
 
-import os
 import re
-import subprocess
 import sys
-from importlib.util import find_spec
 from pathlib import Path
 from threading import Lock
 from typing import NamedTuple
@@ -19,6 +16,7 @@ from stickslip_schemas.transport.addresses import URL_VARIABLE
 
 from stickslip_services.cli.common import FILE, asks, json_option, shows_errors
 from stickslip_services.cli.output import print_json, print_table, say, tell
+from stickslip_services.cli.passed_on import PASSES_ARGUMENTS, Program, require_program, run_program
 from stickslip_services.client import pulling
 from stickslip_services.client.answers import printable
 from stickslip_services.client.errors import ClientError, SelectionError
@@ -165,13 +163,17 @@ def pull(
     )
 
 
-@click.command(
-    context_settings={
-        "allow_extra_args": True,
-        "ignore_unknown_options": True,
-        "help_option_names": [],
-    }
+_EXPORT = Program(
+    command="export",
+    package="training",
+    distribution="stickslip-training",
+    extra="export",
+    module="stickslip_training.cli",
+    words=("export",),
 )
+
+
+@click.command(context_settings=PASSES_ARGUMENTS)
 @asks
 def export(client: Client) -> None:
     """Export a dataset to a format of another library.
@@ -179,24 +181,15 @@ def export(client: Client) -> None:
     Passes all arguments on to `stickslip-train export`. A DATASET[:vN] of the coordinator becomes
     the URL of a version.
     """
-    if find_spec("stickslip_training") is None:
-        raise ClientError(
-            "`stickslip export` needs the training package: "
-            + install_hint("stickslip-training", "export")
-        )
+    require_program(_EXPORT)
     arguments = []
     for argument in click.get_current_context().args:
         if DATASET_ID.fullmatch(argument.partition(":")[0]):
             name = _resolve(client, argument)
             argument = f"{client.url}/v1/datasets/{name.dataset}/versions/{name.version}"
         arguments.append(argument)
-    # In a process of its own: torch and the packages of an export are heavy, and may be missing.
-    process = subprocess.run(
-        [sys.executable, "-m", "stickslip_training.cli", "export", *arguments],
-        env=os.environ | {URL_VARIABLE: client.url},  # the key belongs to this coordinator
-        check=False,
-    )
-    raise Exit(process.returncode)
+    # The key belongs to this coordinator.
+    run_program(_EXPORT, arguments, {URL_VARIABLE: client.url})
 
 
 def _resolve(client: Client, text: str) -> VersionName:
