@@ -56,7 +56,11 @@ def matrices_of_vectors(vectors: Floats) -> Floats:
 
 def vectors_of_matrices(matrices: Floats) -> Floats:
     """Return the rotation vectors (n, 3) of rotations (n, 3, 3), up to half a turn [rad]."""
-    quaternions = quaternions_of_matrices(matrices)
+    return vectors_of_quaternions(quaternions_of_matrices(matrices))
+
+
+def vectors_of_quaternions(quaternions: Floats) -> Floats:
+    """Return the rotation vectors (n, 3) of unit quaternions (n, 4), up to half a turn [rad]."""
     # A quaternion and its negative are the same rotation, once the short and once the long way.
     w = np.abs(quaternions[:, 0])
     v = np.where(quaternions[:, :1] < 0.0, -1.0, 1.0) * quaternions[:, 1:]

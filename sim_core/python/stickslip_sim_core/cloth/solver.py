@@ -6,6 +6,7 @@ The module is a thin layer over the C++ solver.
 import os
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -117,11 +118,6 @@ class Cloth:
         self.self_contact = self_contact
         self.time = 0.0
         """Time at the end of the last step [s]."""
-        # The C++ solver has one list of vertices for all surfaces, one surface after the other.
-        self._surface_sizes = sizes = [len(surface.at(self.time)) for surface in self.surfaces]
-        corners = [np.asarray(surface.triangles) for surface in self.surfaces]
-        mu, mu_static, thickness = self._touch(sheets)
-        edge_fraction, second_fraction = BEARING[self_contact.bearing if self_contact else "all"]
         # The lightest fabric gives the smallest unit, so no sheet converges too early.
         patch_weight = (
             min((fabric.density for fabric in self.fabrics), default=np.nan)
@@ -130,40 +126,18 @@ class Cloth:
         )
         self.force_scale = patch_weight if force_scale is None else force_scale
         """Unit of residual forces [N]: the weight of 25 mm^2, unless the caller gives another."""
+        # The C++ solver has one list of vertices for all surfaces, one surface after the other.
+        self._surface_sizes = [len(surface.at(self.time)) for surface in self.surfaces]
+        kernel = os.environ.get(KERNEL_VARIABLE, "") if kernel is None else kernel
         # `hold` makes a new solver with other held vertices, and all else as here.
         self._make = partial(
             ClothSolver,
             mesh.rest,
             mesh.triangles,
-            [
-                (
-                    fabric.density,
-                    fabric.stretching,
-                    fabric.rigidity,
-                    fabric.damping,
-                    fabric.softening or 0.0,
-                )
-                for fabric in self.fabrics
-            ],
-            tolerance=preset.tolerance * self.force_scale,
-            **{name: getattr(preset, name) for name in PASSED_ON},
-            # A fixed step has no error to keep, and `advance` takes it as the longest step.
-            step_error=preset.step_error or np.inf,
-            longest_step=preset.longest_step if preset.step_error else preset.time_step,
-            kernel=os.environ.get(KERNEL_VARIABLE, "") if kernel is None else kernel,
-            thickness=thickness.tolist(),
-            mu=mu,
-            edge_fraction=edge_fraction,
-            second_fraction=second_fraction,
-            # Shift the numbers of a surface's vertices past the vertices of earlier surfaces.
-            surface_triangles=np.concatenate(
-                [np.empty((0, 3), np.int32), *(c + sum(sizes[:s]) for s, c in enumerate(corners))],
-                dtype=np.int32,
-            ),
-            surface_of_vertex=np.repeat(np.arange(len(sizes)), sizes).tolist(),
-            surface_positions=self._surfaces_at(self.time),
-            crease=[surface.crease for surface in self.surfaces],
-            mu_static=mu_static,
+            [_solver_fabric(fabric) for fabric in self.fabrics],
+            kernel=kernel,
+            **self._solver_settings(),
+            **self._solver_contact(sheets),
         )
         self._solver = self._make(held=self.held.tolist())
         # Time, positions and velocities before the last step. The time inf stands for no step yet.
@@ -183,6 +157,41 @@ class Cloth:
         """
         self._spent = 0.0
         self.gravity = np.tile([0.0, 0.0, -GRAVITY], (len(mesh.rest), 1))
+
+    def _solver_settings(self) -> dict[str, Any]:
+        """Return what the C++ solver takes from the preset."""
+        preset = self.preset
+        settings = {name: getattr(preset, name) for name in PASSED_ON}
+        settings["tolerance"] = preset.tolerance * self.force_scale
+        # A fixed step has no error to keep, and `advance` takes it as the longest step.
+        settings["step_error"] = preset.step_error or np.inf
+        settings["longest_step"] = preset.longest_step if preset.step_error else preset.time_step
+        return settings
+
+    def _solver_contact(self, sheets: int) -> dict[str, Any]:
+        """Return what the C++ solver takes about contact of sheets and surfaces."""
+        mu, mu_static, thickness = self._touch(sheets)
+        bearing = self.self_contact.bearing if self.self_contact else "all"
+        edge_fraction, second_fraction = BEARING[bearing]
+        # Shift the numbers of a surface's vertices past the vertices of earlier surfaces.
+        sizes = self._surface_sizes
+        corners = [
+            np.asarray(surface.triangles) + sum(sizes[:before])
+            for before, surface in enumerate(self.surfaces)
+        ]
+        return {
+            "thickness": thickness.tolist(),
+            "mu": mu,
+            "mu_static": mu_static,
+            "edge_fraction": edge_fraction,
+            "second_fraction": second_fraction,
+            "surface_triangles": np.concatenate(
+                [np.empty((0, 3), np.int32), *corners], dtype=np.int32
+            ),
+            "surface_of_vertex": np.repeat(np.arange(len(sizes)), sizes).tolist(),
+            "surface_positions": self._surfaces_at(self.time),
+            "crease": [surface.crease for surface in self.surfaces],
+        }
 
     def _touch(self, sheets: int) -> tuple[Floats, Floats, Floats]:
         """Return kinetic and static friction of sheets and surfaces, and thicknesses.
@@ -627,6 +636,12 @@ class Cloth:
         Contact is ignored. The state is stable if the eigenvalue is > 0.
         """
         return float(self._solver.softest(self.positions))
+
+
+def _solver_fabric(fabric: Fabric) -> tuple[Any, ...]:
+    """Return a fabric as the C++ solver takes it."""
+    softening = fabric.softening or 0.0
+    return fabric.density, fabric.stretching, fabric.rigidity, fabric.damping, softening
 
 
 def _next_of(ascending: Floats, time: float) -> float:

@@ -21,6 +21,7 @@ from stickslip_sim_core.rods.solve import (
     rod_stiffness,
     solve_general_rods,
 )
+from stickslip_sim_core.rotations import vectors_of_quaternions
 from stickslip_sim_core.splines import bspline_matrix, interpolation_matrix
 
 ELEMENTS_MIN = 96
@@ -205,18 +206,12 @@ def _chain_curvature(quaternions: Floats) -> Floats:
     A node has the mean curvature of its two elements. A node at an end has the curvature of its
     only element.
     """
-    # The quaternion (w, v) from one frame to the next holds half the turn of an element.
+    # The quaternion (w, v) from one frame to the next is the turn of an element.
     p = quaternions[:-1]
     q = quaternions[1:]
     w = (p * q).sum(axis=1)
     v = p[:, :1] * q[:, 1:] - q[:, :1] * p[:, 1:] - np.cross(p[:, 1:], q[:, 1:])
-    sine = np.linalg.norm(v, axis=1)
-    kappa = (
-        2.0
-        * len(p)
-        * np.where(sine > 1e-8, np.arctan2(sine, w) / np.maximum(sine, 1e-8), 1.0)[:, None]
-        * v
-    )
+    kappa = len(p) * vectors_of_quaternions(np.column_stack([w, v]))
     return np.concatenate([kappa[:1], 0.5 * (kappa[1:] + kappa[:-1]), kappa[-1:]])
 
 
