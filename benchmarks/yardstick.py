@@ -91,7 +91,7 @@ def order_of(cell: Cell) -> int:
 def row_of(cell: Cell) -> Document:
     """Return a cell without its curves; what is empty is left out."""
     facts = asdict(cell)
-    for name in ("x", "measured", "reference", "key"):
+    for name in ("x", "measured", "reference", "key", "sources"):
         del facts[name]
     facts["cpu"] = round(cell.cpu, 1)
     facts["value"] = rounded(cell.value)

@@ -1,5 +1,6 @@
 """A campaign goes on after a fault, and where it was interrupted."""
 
+import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -27,7 +28,8 @@ LATE = "if self.time > 0.295:"
 def measured(program: Program, out: Path, *names: str, seconds: float = 60.0) -> list[Cell]:
     """Measure the default row, and return its cells."""
     cells: list[Cell] = []
-    measure(Request(program, out, names, ("default",), seconds), cells.append)
+    request = Request(program, out, names, ("default",), seconds)
+    measure(request, lambda cell, is_recorded: cells.append(cell))
     return cells
 
 
@@ -75,11 +77,64 @@ def test_a_campaign_goes_on_where_it_stopped(falling: Adapter, tmp_path: Path) -
     measured(program, tmp_path, "creep")
     assert path.stat().st_mtime_ns == first
     # A cell without a value is repeated on request, and every cell of a changed adapter is.
-    measure(Request(program, tmp_path, ("creep",), ("default",), 60.0, retry=True), lambda _: None)
+    request = Request(program, tmp_path, ("creep",), ("default",), 60.0, retry="missing")
+    measure(request, lambda cell, is_recorded: None)
     second = path.stat().st_mtime_ns
     assert second > first
     measured(falling(step=f"{LATE} raise ValueError('gone')"), tmp_path, "creep")
-    assert read_cell(path).reason == "ValueError: gone"
+    assert read_cell(path).reason == "ValueError: gone (adapter.py, line 20)"
+
+
+@pytest.mark.parametrize("when", ["import", "constructor"])
+def test_a_change_of_an_imported_module_is_measured(
+    written: Callable[[str], Program], falling_text: str, tmp_path: Path, when: str
+) -> None:
+    places = {
+        "import": f"import physics\n{falling_text}",
+        "constructor": falling_text.replace(
+            "self.x = scene", "global physics; import physics; self.x = scene"
+        ),
+    }
+    text = places[when].replace("self.gravity * self.frame", "np.array(physics.PULL) * self.frame")
+    program = written(text)
+    module = tmp_path / "physics.py"
+    out = tmp_path / "out"
+    flags: list[bool] = []
+    values = []
+    for pull in (-9.81, -9.81, -4.905):
+        module.write_text(f"PULL = [0.0, 0.0, {pull}]\n")
+        request = Request(program, out, (), ("default",), 60.0)
+        measure(request, lambda cell, is_recorded: flags.append(is_recorded))
+        values.append(read_cell(out / "falling" / "default" / "fall-4.json").value)
+    assert values == pytest.approx([1.0, 1.0, 0.5])
+    # The checks are two cells; `balance` ran, too, since the patch says that it can hold vertices.
+    assert flags == [False, False, True, True, False, False]
+    sources = read_cell(out / "falling" / "default" / "fall-4.json").sources
+    assert set(sources) == {str(program.adapter), str(module)}
+
+
+def test_a_cell_of_an_older_version_is_measured_again(falling: Adapter, tmp_path: Path) -> None:
+    measured(falling(), tmp_path)
+    path = tmp_path / "falling" / "default" / "fall-4.json"
+    facts = json.loads(path.read_text())
+    path.write_text(json.dumps({**facts, "sources": {}, "value": 7.0}))
+    measured(falling(), tmp_path)
+    assert read_cell(path).value == pytest.approx(1.0)
+
+
+def test_a_cell_that_hangs_spares_the_finer_ones_and_shortens_the_others(
+    falling: Adapter, tmp_path: Path
+) -> None:
+    program = falling(step=f"{LATE} time.sleep(600)")
+    cells = measured(program, tmp_path, "creep", "incline-onset", seconds=10.0)
+    states = {(cell.experiment, cell.cells): cell for cell in cells}
+    assert states["creep", 5].state == states["incline-onset", 5].state == "hangs"
+    assert states["creep", 10].reason == "a coarser mesh hangs"
+    assert {states["creep", n].state for n in (10, 20)} == {"not run"}
+    # The first of them, a check, has half of the limit, and all others a tenth.
+    assert "did not end within 5 s" in states["balance", 4].reason
+    assert "did not end within 1 s" in states["creep", 5].reason
+    assert "did not end within 1 s" in states["incline-onset", 5].reason
 
 
 def test_a_cell_whose_cpu_time_is_over_ends_and_finer_ones_are_not_run(
@@ -88,7 +143,7 @@ def test_a_cell_whose_cpu_time_is_over_ends_and_finer_ones_are_not_run(
     cells: list[Cell] = []
     busy = falling(step="while time.process_time() < 0.3 + self.time: pass")
     request = Request(busy, tmp_path, ("creep",), ("default",), 60.0, budget=0.5)
-    measure(request, cells.append)
+    measure(request, lambda cell, is_recorded: cells.append(cell))
     states = {(cell.experiment, cell.cells): cell.state for cell in cells}
     assert states["creep", 5] == "not finished"
     assert states["creep", 10] == states["creep", 20] == "not run"
@@ -116,8 +171,8 @@ def test_the_page_says_who_holds_and_why_a_cell_has_no_value(
     page = write_page(tmp_path).read_text()
     assert "<h1>Who holds, and who creeps</h1>" in page
     # The verdict, the cell of creep, and the reason of both; text of an adapter is no markup.
-    entry = 'class="none" data-column="verdict" title="ValueError: &lt;lost&gt;">no answer</td>'
-    assert entry in page
+    reason = "ValueError: &lt;lost&gt; (adapter.py, line 20)"
+    assert f'class="none" data-column="verdict" title="{reason}">no answer</td>' in page
     assert "failed: ValueError: &lt;lost&gt;" in page
     assert "<lost>" not in page
     assert "not supported: needs curved, planes" in page
@@ -133,18 +188,88 @@ def test_the_command_writes_a_page_or_says_that_nothing_was_measured(
 ) -> None:
     out = tmp_path / "out"
     assert main(["--out", str(out)]) == 1
-    assert "has no cells; name a simulator with --simulator" in capsys.readouterr().err
+    assert "has no results; name a simulator with --simulator" in capsys.readouterr().err
     adapter = str(falling().adapter)
-    assert main(["--simulator", adapter, "--experiment", "pinch", "--out", str(out)]) == 0
+    assert main(["--simulator", adapter, "--experiment", "pinch", "--out", str(out)]) == 1
     assert capsys.readouterr().out.splitlines()[-1] == str(out / "index.html")
     assert (out / "index.html").exists()
+
+
+def test_lines_say_what_is_of_an_earlier_run(
+    falling: Adapter, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    adapter = str(falling().adapter)
+    command = ["--simulator", adapter, "--experiment", "kinetic-friction", "--out", str(tmp_path)]
+    note = "results are of an earlier run; --retry all measures them again"
+    assert main(command) == 0
+    first = capsys.readouterr().out
+    assert "default    kinetic-friction     5 cells" in first
+    assert "earlier run" not in first
+    assert main(command) == 0
+    second = capsys.readouterr().out
+    assert second.count("[from an earlier run]") == 5
+    assert f"5 of 5 {note}" in second
+    assert main([*command, "--retry", "all"]) == 0
+    assert "earlier run" not in capsys.readouterr().out
+
+
+def test_a_run_without_a_value_says_where_the_tracebacks_are(
+    falling: Adapter, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    adapter = str(falling(f"{LATE} raise TypeError('lost')").adapter)
+    command = ["--simulator", adapter, "--experiment", "creep", "--out", str(tmp_path)]
+    assert main(command) == 1
+    printed = capsys.readouterr().out
+    assert "failed: TypeError: lost (adapter.py, line 20)" in printed
+    place = tmp_path / "falling" / "ROW" / "EXPERIMENT-CELLS.log"
+    assert f"Tracebacks and other output: {place}" in printed
+    log = place.parents[1] / "default" / "creep-5.log"
+    assert 'adapter.py", line 20, in step' in log.read_text()
+
+
+def test_faults_are_those_of_the_requested_experiments(
+    falling: Adapter, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    adapter = str(falling().adapter)
+    # It falls along the slope, too, and so creeps by metres.
+    main(["--simulator", adapter, "--experiment", "creep", "--out", str(tmp_path)])
+    assert "cloth creeps" in capsys.readouterr().out
+    main(["--simulator", adapter, "--experiment", "kinetic-friction", "--out", str(tmp_path)])
+    assert "cloth creeps" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("class Simulator:", "class Falling:"), "must define the class Simulator, got Falling"),
+        (('    version = "1"', "    pass"), "the class Simulator must have version"),
+        (
+            ('"default"', '"other"'),
+            "must be a row of the adapter's `settings` (other), got default",
+        ),
+    ],
+)
+def test_an_adapter_that_breaks_the_contract_at_once(
+    written: Callable[[str], Program],
+    falling_text: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    change: tuple[str, str],
+    message: str,
+) -> None:
+    program = written(falling_text.replace(*change))
+    command = ["--simulator", str(program.adapter), "--out", str(tmp_path / "out")]
+    assert main([*command, "--setting", "default"]) == 1
+    errors = capsys.readouterr().err
+    assert message in errors
+    assert f"{tmp_path / 'out' / 'adapter.log'} has its output" in errors
 
 
 def test_a_damaged_cell_says_what_to_do(falling: Adapter, tmp_path: Path) -> None:
     measured(falling(), tmp_path)
     path = tmp_path / "falling" / "default" / "fall-4.json"
     path.write_text("{}")
-    with pytest.raises(ValueError, match="is no cell: delete it and measure again"):
+    with pytest.raises(ValueError, match="is no result: delete it and measure again"):
         measured(falling(), tmp_path)
 
 
@@ -191,6 +316,7 @@ def test_there_are_twelve_experiments_with_three_resolutions() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (("--simulator", "toy.py"), "the file 'toy.py' does not exist"),
         (("--simulator", "bullet4"), "must be a Python file or one of bullet, elastica"),
         (("--experiment", "fold"), "invalid choice: 'fold'"),
         (("--timeout", "-3"), "must be above 0 and below 1e6 s"),

@@ -19,7 +19,10 @@ def cells_of(fault: str, names: Sequence[str], out: Path) -> list[Cell]:
     """Return the cells of the core with a fault."""
     cells: list[Cell] = []
     program = Program(FAULTY, environment={**os.environ, "FAULT": fault})
-    measure(Request(program, out, names, ("default",), seconds=120.0), cells.append)
+    measure(
+        Request(program, out, names, ("default",), seconds=120.0),
+        lambda cell, is_recorded: cells.append(cell),
+    )
     return cells
 
 

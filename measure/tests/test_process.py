@@ -77,8 +77,8 @@ def test_what_a_simulator_prints_does_not_disturb(falling: Adapter, tmp_path: Pa
 @pytest.mark.parametrize(
     ("step", "start", "error", "reason"),
     [
-        ("raise KeyError('v')", "pass", StepError, "KeyError: 'v'"),
-        ("pass", "raise RuntimeError('no GPU')", SetupError, "RuntimeError: no GPU"),
+        ("raise KeyError('v')", "pass", StepError, r"KeyError: 'v' \(adapter\.py, line 20\)"),
+        ("pass", "raise RuntimeError('no GPU')", SetupError, r"no GPU \(adapter\.py, line 13\)"),
         ("pass", "del Simulator.frame", SetupError, "frame"),
         ("os.kill(os.getpid(), signal.SIGSEGV)", "pass", CrashError, "signal SIGSEGV"),
         ("raise SystemExit(3)", "pass", CrashError, "exit code 3"),
@@ -107,22 +107,60 @@ def test_a_frame_that_is_no_time_breaks_the_contract(
         fall(falling(frame=frame), tmp_path / "log")
 
 
-def test_a_step_that_hangs_ends_in_time(falling: Adapter, tmp_path: Path) -> None:
-    with AdapterProcess(falling(step="time.sleep(600)"), tmp_path / "log", 60.0) as process:
+@pytest.mark.parametrize(
+    ("step", "reason"),
+    [
+        ("time.sleep(600)", "step 1 of the scene, which begins at 0 s, did not end"),
+        (
+            "time.sleep(600 if self.time > 0.185 else 0)",
+            r"step 20 of the scene, which begins at 0\.19 s, did not end within .* before it took",
+        ),
+    ],
+    ids=["first", "later"],
+)
+def test_a_step_that_does_not_end_is_named(
+    falling: Adapter, tmp_path: Path, step: str, reason: str
+) -> None:
+    with AdapterProcess(falling(step=step), tmp_path / "log", 60.0) as process:
         simulation = Simulation(process, patch(), "default")
-        process.deadline = time.monotonic() + 0.5
-        with pytest.raises(HangError, match="no step ended within 60 s"):
+        process.patience = 0.5
+        with pytest.raises(HangError, match=reason):
             simulation.rest(0.3, DOWN)
 
 
 def test_slow_is_not_hanging(falling: Adapter, tmp_path: Path) -> None:
-    slow = falling(step="time.sleep(600 if self.time > 0.155 else 0)")
+    slow = falling(step="time.sleep(0.1)")
     with AdapterProcess(slow, tmp_path / "log", 60.0) as process:
         simulation = Simulation(process, patch(), "default")
-        simulation.rest(0.1, DOWN)
-        process.deadline = time.monotonic() + 0.5
-        with pytest.raises(SlowError, match=r"60 s were over after 0\.1 s of the scene"):
+        process.deadline = time.monotonic() + 1.5
+        with pytest.raises(SlowError, match=r"limit of 60 s .* was at 0\.1\d? s, after 1\d steps"):
             simulation.rest(10.0, DOWN)
+
+
+def test_a_step_that_is_far_longer_than_the_others_hangs_also_at_the_end_of_the_time(
+    falling: Adapter, tmp_path: Path
+) -> None:
+    program = falling(step="time.sleep(600 if self.time > 0.045 else 0)")
+    with AdapterProcess(program, tmp_path / "log", 60.0) as process:
+        simulation = Simulation(process, patch(), "default")
+        process.deadline = time.monotonic() + 2.0
+        with pytest.raises(HangError, match="step 6 of the scene"):
+            simulation.rest(0.3, DOWN)
+
+
+def test_a_constructor_that_does_not_end(falling: Adapter, tmp_path: Path) -> None:
+    program = falling(start="time.sleep(600)")
+    with (
+        AdapterProcess(program, tmp_path / "log", 4.0) as process,
+        pytest.raises(HangError, match="its constructor did not end within 2 s"),
+    ):
+        Simulation(process, patch(), "default")
+
+
+def test_an_import_that_does_not_end(written: Callable[[str], Program], tmp_path: Path) -> None:
+    program = written("import time\ntime.sleep(600)")
+    with pytest.raises(HangError, match=r"its import did not end within 0\.5 s"):
+        describe(program, tmp_path / "log", 1.0)
 
 
 def test_an_interpreter_that_does_not_exist(tmp_path: Path) -> None:

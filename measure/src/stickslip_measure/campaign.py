@@ -1,7 +1,8 @@
 """Measures one simulator: every experiment at three resolutions, each result a file of its own.
 
 A result, a **cell**, is written when it is there, so a campaign that was interrupted goes on where
-it stopped. A cell is measured again if the adapter or the experiments have changed.
+it stopped. A cell is measured again if the adapter, a module that it imports from outside of
+site-packages, the version of the simulator or the experiments have changed.
 """
 
 import hashlib
@@ -10,20 +11,47 @@ import math
 import os
 import platform
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Literal
 
 from stickslip_measure import experiments
-from stickslip_measure.contract import SETTINGS
+from stickslip_measure.contract import SETTINGS, Floats
 from stickslip_measure.convergence import Convergence, converged
 from stickslip_measure.laboratory import Experiment, Laboratory
-from stickslip_measure.process import AdapterError, Description, Program, SlowError, describe
+from stickslip_measure.process import (
+    PATIENCE,
+    AdapterError,
+    Description,
+    HangError,
+    Program,
+    SetupError,
+    SlowError,
+    describe,
+)
 
 MEASURED = "measured"
 NOT_RUN = "not run"
 NOT_SUPPORTED = "not supported"
+
+OBSTACLES = {
+    SlowError.state: "a coarser mesh was not finished",
+    HangError.state: "a coarser mesh hangs",
+}
+"""States of a cell after which finer resolutions are not run, and why."""
+
+IMPATIENCE = 0.1
+"""Share of the time limit that a step may take after another cell of the row has hung.
+
+A simulator that hangs in one scene often hangs in all, and each would take the whole limit.
+"""
+
+LOG = "adapter.log"
+"""File for the output of an adapter's import."""
+
+Retry = Literal["missing", "all"]
 
 CALIBRATED = "bending calibrated"
 """End of the name of a row whose bending stiffness was divided by the cantilever's value."""
@@ -57,7 +85,10 @@ class Cell:
     """CPU time of the simulator's process [s]."""
 
     key: str
-    """Digest of adapter, interpreter and experiments."""
+    """Digest of interpreter, version, row and experiments."""
+
+    sources: dict[str, str] = field(default_factory=dict)
+    """Digests of the adapter and of what it imports from outside of site-packages, by path."""
 
     conditions: dict[str, str | float] = field(default_factory=dict)
     """When and where it was measured: `conditions_of`."""
@@ -92,135 +123,189 @@ class Request:
     budget: float = 600.0
     """Limit of the CPU time of a cell [s]."""
 
-    retry: bool = False
-    """Whether cells without a value are measured again."""
+    retry: Retry | None = None
+    """Cells that are measured again: those without a value, or all. None measures none again."""
 
 
-def measure(request: Request, tell: Callable[[Cell], None]) -> Description:
+@dataclass
+class _Row:
+    """A row that is measured."""
+
+    request: Request
+    description: Description
+    setting: str
+    name: str
+    softer: float = 1.0
+    """Factor on the bending stiffness."""
+
+    patience: float = PATIENCE
+    """Share of the time limit that a step may take."""
+
+
+Tell = Callable[[Cell, bool], None]
+"""Takes a cell, and whether it is of an earlier run."""
+
+
+def measure(request: Request, tell: Tell) -> Description:
     """Measure a simulator; `tell` gets each cell when it is there.
 
     Raises:
-        SetupError: The adapter cannot be imported.
+        SetupError: The adapter cannot be imported, or has none of the rows.
         AdapterError: Its process fails before any scene.
     """
     request.out.mkdir(parents=True, exist_ok=True)
-    log = request.out / "adapter.log"
+    log = request.out / LOG
     description = describe(request.program, log, request.seconds)
+    # A simulator may have one row only.
+    settings = [setting for setting in request.settings if setting in description.settings]
+    if not settings:
+        raise SetupError(
+            f"--setting: must be a row of the adapter's `settings` "
+            f"({', '.join(description.settings)}), got {', '.join(request.settings)}"
+        )
     folder = request.out / description.name
     folder.mkdir(exist_ok=True)
     facts = {**asdict(description), "capabilities": sorted(description.capabilities)}
+    # Each cell has its own.
+    del facts["sources"]
     (folder / "simulator.json").write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
-    for setting in request.settings:
-        # A simulator may have one row only.
-        if setting in description.settings:
-            for cell in _row(request, description, setting):
-                tell(cell)
+    for setting in settings:
+        for cell, is_recorded in _cells_of(_Row(request, description, setting, setting)):
+            tell(cell, is_recorded)
     return description
 
 
-def _row(request: Request, description: Description, setting: str) -> Iterator[Cell]:
+def _cells_of(row: _Row) -> Iterator[tuple[Cell, bool]]:
     # A fault that the checks find explains values of the experiments.
-    chosen = [*experiments.CHECKS, *request.names]
-    for name in chosen:
-        yield from _experiment(request, description, setting, setting, _named(name), 1.0)
+    for name in (*experiments.CHECKS, *row.request.names):
+        yield from _experiment(row, _named(name))
     # A simulator with another bending model may still bend right, up to a factor.
-    stiffness = _stiffness(request, description, setting)
+    stiffness = _stiffness(row)
     if stiffness is None or abs(stiffness - 1.0) < FACTOR:
         return
+    calibrated = replace(row, name=f"{row.setting}, {CALIBRATED}", softer=1.0 / stiffness)
     for name in experiments.BENDING:
-        if name in request.names:
-            row = f"{setting}, {CALIBRATED}"
-            yield from _experiment(
-                request, description, setting, row, _named(name), 1.0 / stiffness
-            )
+        if name in row.request.names:
+            yield from _experiment(calibrated, _named(name))
 
 
 def _named(name: str) -> Experiment:
     return {**experiments.CHECKS, **experiments.EXPERIMENTS}[name]
 
 
-def _stiffness(request: Request, description: Description, setting: str) -> float | None:
-    """Return the bending stiffness of the cantilever at its default resolution, over D."""
+def _stiffness(row: _Row) -> float | None:
+    """Return the bending stiffness of the cantilever at its middle resolution, over D."""
     cantilever = experiments.EXPERIMENTS["cantilever"]
-    path = _path(request, description, setting, cantilever, cantilever.default)
-    if cantilever.name not in request.names or not path.exists():
+    path = _path(row, cantilever, cantilever.middle)
+    if cantilever.name not in row.request.names or not path.exists():
         return None
     return read_cell(path).value
 
 
-def _experiment(
-    request: Request,
-    description: Description,
-    setting: str,
-    row: str,
-    experiment: Experiment,
-    softer: float,
-) -> Iterator[Cell]:
-    key = _key(request.program, description, setting, softer, experiment)
-    slow = False
+def _experiment(row: _Row, experiment: Experiment) -> Iterator[tuple[Cell, bool]]:
+    key = _key(row, experiment)
+    obstacle = ""
     for cells in experiment.cells:
-        path = _path(request, description, row, experiment, cells)
-        if path.exists():
-            known = read_cell(path)
-            if known.key == key and (known.value is not None or not request.retry):
-                slow = slow or known.state == SlowError.state
-                yield known
-                continue
-        log = path.with_suffix(".log")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        laboratory = Laboratory(
-            request.program, description, setting, log, request.seconds, request.budget, softer
-        )
-        cell = _cell(laboratory, experiment, cells, row, key, slow)
-        slow = slow or cell.state == SlowError.state
-        cell = replace(cell, conditions=conditions_of(request))
-        _write(path, cell)
-        yield cell
+        path = _path(row, experiment, cells)
+        cell = _recorded(path, key, row.request.retry)
+        is_recorded = cell is not None
+        if cell is None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            cell = _cell(row, experiment, cells, path.with_suffix(".log"), key, obstacle)
+            _write(path, cell)
+        obstacle = OBSTACLES.get(cell.state, obstacle)
+        if cell.state == HangError.state:
+            row.patience = IMPATIENCE
+        yield cell, is_recorded
+
+
+def _recorded(path: Path, key: str, retry: Retry | None) -> Cell | None:
+    """Return the cell of an earlier run, or None if it is measured now."""
+    if not path.exists() or retry == "all":
+        return None
+    cell = read_cell(path)
+    if cell.key != key or not _is_current(cell.sources):
+        return None
+    return None if retry == "missing" and cell.value is None else cell
 
 
 def _cell(
-    laboratory: Laboratory, experiment: Experiment, cells: int, row: str, key: str, slow: bool
+    row: _Row, experiment: Experiment, cells: int, log: Path, key: str, obstacle: str
 ) -> Cell:
     """Measure a cell. Whatever goes wrong in the adapter is its reason.
 
-    `slow` says that a coarser resolution took too much time already, so this one is not run.
+    `obstacle` says why a coarser resolution has ended early, so that this one is not run.
     """
-    description = laboratory.description
-    facts = (description.name, description.version, row, experiment.name, cells)
+    description = row.description
+    conditions = conditions_of(row.request)
+    blank = Cell(
+        description.name,
+        description.version,
+        row.name,
+        experiment.name,
+        cells,
+        NOT_RUN,
+        obstacle,
+        None,
+        None,
+        0.0,
+        key,
+        sources=dict(description.sources),
+        conditions=conditions,
+    )
     missing = sorted(experiment.needs - description.capabilities)
     # Who has rods only has no cloth, which all other experiments need.
     if description.capabilities == {"rods"} and "rods" not in experiment.needs:
         missing = ["cloth"]
     if missing:
-        reason = f"needs {', '.join(missing)}"
-        return Cell(*facts, NOT_SUPPORTED, reason, None, None, 0.0, key)
-    if slow:
-        reason = "a coarser resolution was not finished"
-        return Cell(*facts, NOT_RUN, reason, None, None, 0.0, key)
+        return replace(blank, state=NOT_SUPPORTED, reason=f"needs {', '.join(missing)}")
+    if obstacle:
+        return blank
+    request = row.request
+    laboratory = Laboratory(
+        request.program,
+        description,
+        row.setting,
+        log,
+        request.seconds,
+        request.budget,
+        row.softer,
+        row.patience,
+    )
+    return _measured(blank, experiment, laboratory)
+
+
+def _measured(blank: Cell, experiment: Experiment, laboratory: Laboratory) -> Cell:
+    """Return a cell with its result."""
     with laboratory:
         try:
-            reading = experiment.measure(laboratory, cells)
+            reading = experiment.measure(laboratory, blank.cells)
         except AdapterError as error:
-            return Cell(*facts, error.state, str(error), None, None, laboratory.cpu, key)
-        # A picture needs fewer points than a simulation has steps.
-        every = max(1, len(reading.x) // POINTS)
-        curves = [
-            [float(f"{number:.{DIGITS}g}") for number in curve[::every]]
-            for curve in (reading.x, reading.measured, reading.reference)
-        ]
-        return Cell(
-            *facts,
-            MEASURED,
-            "",
-            reading.value,
-            reading.expected,
-            laboratory.cpu,
-            key,
-            details=dict(reading.details),
-            x=curves[0],
-            measured=curves[1],
-            reference=curves[2],
-        )
+            result = replace(blank, state=error.state, reason=str(error))
+        else:
+            x, measured, reference = (
+                _thinned(curve) for curve in (reading.x, reading.measured, reading.reference)
+            )
+            result = replace(
+                blank,
+                state=MEASURED,
+                reason="",
+                value=reading.value,
+                expected=reading.expected,
+                details=dict(reading.details),
+                x=x,
+                measured=measured,
+                reference=reference,
+            )
+    return replace(result, cpu=laboratory.cpu, sources=laboratory.sources)
+
+
+def _thinned(curve: Floats) -> list[float]:
+    """Return a curve as a cell keeps it: a picture needs fewer points than a scene has steps."""
+    every = max(1, len(curve) // POINTS)
+    # The last point is often the value.
+    places = sorted({*range(0, len(curve), every), len(curve) - 1})
+    return [float(f"{curve[place]:.{DIGITS}g}") for place in places]
 
 
 def conditions_of(request: Request) -> dict[str, str | float]:
@@ -233,25 +318,35 @@ def conditions_of(request: Request) -> dict[str, str | float]:
     }
 
 
-def _path(
-    request: Request, description: Description, row: str, experiment: Experiment, cells: int
-) -> Path:
-    return request.out / description.name / row / f"{experiment.name}-{cells}.json"
+def _path(row: _Row, experiment: Experiment, cells: int) -> Path:
+    folder = row.request.out / row.description.name / row.name
+    return folder / f"{experiment.name}-{cells}.json"
 
 
-def _key(
-    program: Program, description: Description, setting: str, softer: float, experiment: Experiment
-) -> str:
-    """Return a digest of all that decides a cell: of the simulator itself, its version."""
+def _key(row: _Row, experiment: Experiment) -> str:
+    """Return a digest of what decides a cell besides its sources."""
     digest = hashlib.sha256()
     # A changed experiment changes the meaning of its value. Each stands in one module.
     source = Path(sys.modules[experiment.measure.__module__].__file__ or "")
-    # Adapters of one simulator may share a file, whose name begins with an underscore.
-    shared = sorted(program.adapter.parent.glob("_*.py"))
-    for path in (program.adapter, *shared, Path(__file__).with_name("laboratory.py"), source):
+    for path in (Path(__file__).with_name("laboratory.py"), source):
         digest.update(path.read_bytes())
-    digest.update(f"{program.python} {description.version} {setting} {softer!r}".encode())
+    facts = f"{row.request.program.python} {row.description.version} {row.setting} {row.softer!r}"
+    digest.update(facts.encode())
     return digest.hexdigest()
+
+
+def _is_current(sources: Mapping[str, str]) -> bool:
+    """Return whether files have their digests. A cell without sources is of an older version."""
+    if not sources:
+        return False
+    return all(_digest(Path(path)) == digest for path, digest in sources.items())
+
+
+def _digest(path: Path) -> str | None:
+    """Return the digest of a file, as host.py makes it, or None if it is gone."""
+    if not path.is_file():
+        return None
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _write(path: Path, cell: Cell) -> None:
@@ -270,7 +365,7 @@ def read_cell(path: Path) -> Cell:
     try:
         return Cell(**json.loads(path.read_text(encoding="utf-8")))
     except (TypeError, json.JSONDecodeError) as error:
-        raise ValueError(f"{path} is no cell: delete it and measure again ({error})") from error
+        raise ValueError(f"{path} is no result: delete it and measure again ({error})") from error
 
 
 def read_cells(out: Path) -> list[Cell]:

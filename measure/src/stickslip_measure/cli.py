@@ -1,18 +1,33 @@
 """The command `stickslip-measure`, which `stickslip measure` runs too."""
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
+from typing import get_args
 
 from stickslip_measure import __version__, experiments
-from stickslip_measure.campaign import MEASURED, Cell, Request, measure, read_cells
+from stickslip_measure.campaign import LOG, MEASURED, Cell, Request, Retry, measure, read_cells
 from stickslip_measure.contract import SETTINGS
 from stickslip_measure.diagnosis import findings
-from stickslip_measure.process import AdapterError, Program
+from stickslip_measure.process import AdapterError, CrashError, Program, SetupError, StepError
 
 ADAPTERS = Path(__file__).parent / "adapters"
+
+PROGRAM_VARIABLE = "STICKSLIP_MEASURE_PROGRAM"
+"""Variable of the environment with the name by which the user has called the command."""
+
+RODS = "hanging-rod"
+"""The experiment whose resolution is a number of elements of a rod."""
+
+RECORDED = "  [from an earlier run]"
+"""End of the line of a result that was not measured now."""
+
+LOGGED = {SetupError.state, StepError.state, CrashError.state}
+"""States that the output of the process explains."""
 
 
 def adapter_names() -> list[str]:
@@ -29,11 +44,14 @@ def adapter_path(text: str) -> Path:
     if text in adapter_names():
         return ADAPTERS / f"{text}.py"
     path = Path(text)
-    if not path.is_file():
-        raise argparse.ArgumentTypeError(
-            f"must be a Python file or one of {', '.join(adapter_names())}, got {text!r}"
-        )
-    return path
+    if path.is_file():
+        return path
+    # The name of an adapter that is misspelt is no path.
+    if path.suffix == ".py" or len(path.parts) > 1:
+        raise argparse.ArgumentTypeError(f"the file {text!r} does not exist")
+    raise argparse.ArgumentTypeError(
+        f"must be a Python file or one of {', '.join(adapter_names())}, got {text!r}"
+    )
 
 
 def positive_seconds(text: str) -> float:
@@ -54,16 +72,18 @@ def positive_seconds(text: str) -> float:
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command."""
     command = argparse.ArgumentParser(
-        prog="stickslip-measure",
+        prog=os.environ.get(PROGRAM_VARIABLE, "stickslip-measure"),
         description="Measure the friction and bending of a simulator against closed forms, and "
-        "write a page. Cells that are there already are not measured again.",
+        "write a page. Results of an earlier run are kept, unless the adapter, what it imports "
+        "from outside of site-packages, or the simulator's version has changed. The exit status "
+        "is 1 if no requested experiment has a value.",
     )
     command.add_argument(
         "--simulator",
         type=adapter_path,
         metavar="NAME|ADAPTER.py",
         help=f"what to measure: {', '.join(adapter_names())}, or the file of an adapter; without "
-        "it, only the page is written",
+        "it, only the page is written from the results in --out",
     )
     command.add_argument(
         "--python",
@@ -89,50 +109,109 @@ def parser() -> argparse.ArgumentParser:
         "--budget",
         type=positive_seconds,
         default=600.0,
-        help="limit of the CPU time of a cell in s (600)",
+        help="limit of the CPU time of a result in s (600)",
     )
     command.add_argument(
-        "--retry", action="store_true", help="measure cells without a value once more"
+        "--retry",
+        nargs="?",
+        const="missing",
+        choices=get_args(Retry),
+        help="measure again: requested results without a value (missing, if only --retry is given) "
+        "or all requested ones",
     )
     command.add_argument("--version", action="version", version=__version__)
     return command
 
 
-def line_of(cell: Cell) -> str:
+def line_of(cell: Cell, *, is_recorded: bool = False) -> str:
     """Return the line that is printed for a cell."""
-    place = f"{cell.row:10} {cell.experiment:18} {cell.cells:4}"
+    unit = "elements" if cell.experiment == RODS else "cells"
+    place = f"{cell.row:10} {cell.experiment:18} {cell.cells:3} {unit:8}"
+    ending = RECORDED if is_recorded else ""
     if cell.state != MEASURED:
-        return f"{place}  {cell.state}: {cell.reason}"
-    return f"{place}  {cell.value:.6g} (expected {cell.expected:.6g})  {cell.cpu:.1f} CPU s"
+        return f"{place}  {cell.state}: {cell.reason}{ending}"
+    experiment = {**experiments.CHECKS, **experiments.EXPERIMENTS}[cell.experiment]
+    value = f"{cell.value:.6g} {experiment.unit}".strip()
+    return f"{place}  {value} (expected {cell.expected:.6g})  {cell.cpu:.1f} CPU s{ending}"
+
+
+@dataclass
+class Report:
+    """Prints the results of a request, and keeps them."""
+
+    cells: list[Cell] = field(default_factory=list)
+    recorded: int = 0
+    """Number of results that are of an earlier run."""
+
+    def tell(self, cell: Cell, is_recorded: bool) -> None:
+        """Take and print a result."""
+        self.cells.append(cell)
+        self.recorded += is_recorded
+        print_line(line_of(cell, is_recorded=is_recorded))
+
+    @property
+    def has_value(self) -> bool:
+        """Whether a requested experiment has a value. The checks are none."""
+        return any(
+            cell.value is not None
+            for cell in self.cells
+            if cell.experiment not in experiments.CHECKS
+        )
+
+    def print_findings(self) -> None:
+        """Print the faults that the results show, row by row."""
+        for row in sorted({cell.row for cell in self.cells}):
+            for finding in findings([cell for cell in self.cells if cell.row == row]):
+                print_line(f"{row}: {finding.fault} ({finding.evidence})")
+
+    def print_notes(self, folder: Path) -> None:
+        """Print how to measure earlier results again, and where failures are explained."""
+        if self.recorded:
+            print_line(
+                f"{self.recorded} of {len(self.cells)} results are of an earlier run; "
+                "--retry all measures them again"
+            )
+        if any(cell.state in LOGGED for cell in self.cells):
+            print_line(f"Tracebacks and other output: {folder / 'ROW' / 'EXPERIMENT-CELLS.log'}")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return 1 if the adapter could not be run at all."""
+    """Run the command; return 1 if no requested experiment has a value."""
     options = parser().parse_args(arguments)
-    # Without a simulator nothing is measured: the page shows the existing cells.
-    if options.simulator is not None:
-        request = Request(
-            Program(options.simulator, options.python),
-            options.out,
-            options.experiment or list(experiments.EXPERIMENTS),
-            options.setting or SETTINGS,
-            options.timeout,
-            options.budget,
-            options.retry,
+    # Without a simulator nothing is measured: the page shows the existing results.
+    if options.simulator is None:
+        return print_page(options.out)
+    request = Request(
+        Program(options.simulator, options.python),
+        options.out,
+        options.experiment or list(experiments.EXPERIMENTS),
+        options.setting or SETTINGS,
+        options.timeout,
+        options.budget,
+        options.retry,
+    )
+    report = Report()
+    try:
+        description = measure(request, report.tell)
+    except AdapterError as error:
+        log = options.out / LOG
+        sys.stderr.write(f"{options.simulator}: {error.state}: {error}\n{log} has its output\n")
+        return 1
+    except KeyboardInterrupt:
+        sys.stderr.write(
+            f"interrupted: {len(report.cells)} results are in {options.out}; the same command goes "
+            f"on, and `--out {options.out}` without --simulator writes the page\n"
         )
-        try:
-            description = measure(request, lambda cell: print_line(line_of(cell)))
-        except AdapterError as error:
-            sys.stderr.write(f"{options.simulator}: {error.state}: {error}\n")
-            return 1
-        print_findings(options.out, description.name)
-    return print_page(options.out)
+        return 130
+    report.print_findings()
+    report.print_notes(options.out / description.name)
+    return print_page(options.out) or int(not report.has_value)
 
 
 def print_page(out: Path) -> int:
-    """Write the page, and print where it is; return 1 if no cell is there."""
+    """Write the page, and print where it is; return 1 if no result is there."""
     if not read_cells(out):
-        sys.stderr.write(f"{out}: has no cells; name a simulator with --simulator\n")
+        sys.stderr.write(f"{out}: has no results; name a simulator with --simulator\n")
         return 1
     # Numbers need no matplotlib.
     if find_spec("matplotlib") is None:
@@ -144,15 +223,7 @@ def print_page(out: Path) -> int:
     return 0
 
 
-def print_findings(out: Path, simulator: str) -> None:
-    """Print the faults that the cells of a simulator show, row by row."""
-    cells = [cell for cell in read_cells(out) if cell.simulator == simulator]
-    for row in sorted({cell.row for cell in cells}):
-        for finding in findings([cell for cell in cells if cell.row == row]):
-            print_line(f"{row}: {finding.fault} ({finding.evidence})")
-
-
 def print_line(text: str) -> None:
-    """Print a line at once: the next cell may take minutes."""
+    """Print a line at once: the next result may take minutes."""
     sys.stdout.write(f"{text}\n")
     sys.stdout.flush()

@@ -6,12 +6,16 @@ library and NumPy only, and nothing of this package but two files beside it.
 
 from __future__ import annotations  # Python 3.9 reads the types below as text
 
+import hashlib
 import importlib.util
 import logging
 import os
 import platform
+import site
 import sys
+import sysconfig
 import time
+import traceback
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -27,6 +31,13 @@ REASON_LENGTH = 160
 CLEARANCE = 0.0
 GAP = 5e-4
 
+REQUIRED = ("name", "version", "capabilities", "settings")
+"""Attributes of the class that have no default."""
+
+
+class RuleError(Exception):
+    """The adapter misses a part of the contract. Its message needs no name of an exception."""
+
 
 def load(path: Path, name: str) -> Any:
     """Import a file as the module `name`."""
@@ -40,42 +51,112 @@ def load(path: Path, name: str) -> Any:
     return module
 
 
-def reason_of(error: Exception) -> str:
-    """Return an exception as one short line; the log has all of it."""
+def reason_of(error: Exception, adapter: Path) -> str:
+    """Return an exception as one short line with its place; the log has all of it."""
     lines = str(error).strip().splitlines() or [""]
+    if isinstance(error, RuleError):
+        return lines[0]
     text = f"{type(error).__name__}: {lines[0]}".strip().rstrip(":")
-    return text if len(text) <= REASON_LENGTH else f"{text[:REASON_LENGTH]}..."
+    if len(text) > REASON_LENGTH:
+        text = f"{text[:REASON_LENGTH]}..."
+    # The last line of the adapter itself: below it stand lines of its simulator.
+    numbers = [
+        frame.lineno
+        for frame in traceback.extract_tb(error.__traceback__)
+        if Path(frame.filename) == adapter
+    ]
+    return f"{text} ({adapter.name}, line {numbers[-1]})" if numbers else text
+
+
+class Sources:
+    """Digests of the files of modules that an adapter imports, and that are not installed.
+
+    These are the adapter, what lies beside it, and all that stands outside of the standard library
+    and site-packages: a result is old if one of them has changed.
+
+    Args:
+        adapter: The file of the adapter.
+    """
+
+    def __init__(self, adapter: Path) -> None:
+        self.folder = adapter.parent
+        self.installed = installed_places()
+        self.modules = 0
+        self.names: set[str] = set()
+
+    def additions(self) -> dict[str, str]:
+        """Return the digests (SHA-256) of files that were imported since the last call, by path."""
+        # A look at all modules costs as much as a step of a small scene.
+        if len(sys.modules) == self.modules:
+            return {}
+        self.modules = len(sys.modules)
+        digests = {}
+        for module in list(sys.modules.values()):
+            # `getattr` would load modules that wait to be used.
+            name = getattr(module, "__dict__", {}).get("__file__")
+            if not isinstance(name, str) or name in self.names:
+                continue
+            self.names.add(name)
+            path = Path(name).resolve()
+            if self.belongs(path):
+                digests[str(path)] = hashlib.sha256(path.read_bytes()).hexdigest()
+        return digests
+
+    def belongs(self, path: Path) -> bool:
+        """Return whether the file of a module decides results beside the simulator's version."""
+        # The messages and the contract are this package's.
+        if path.parent == FOLDER or not path.is_file():
+            return False
+        return path.parent == self.folder or not any(
+            place in path.parents for place in self.installed
+        )
+
+
+def installed_places() -> list[Path]:
+    """Return the folders of the standard library and of installed packages."""
+    names = ("stdlib", "platstdlib", "purelib", "platlib")
+    places = [sysconfig.get_paths()[name] for name in names]
+    places += [*site.getsitepackages(), site.getusersitepackages()]
+    return [Path(place).resolve() for place in places]
 
 
 class Host:
     """Answers requests about one adapter. It runs at most one scene."""
 
-    def __init__(self, adapter: Path) -> None:
+    def __init__(self, adapter: Path, replies: BinaryIO) -> None:
         self.contract = load(FOLDER / "contract.py", "stickslip_contract")
         self.wire = load(FOLDER / "wire.py", "stickslip_wire")
         self.adapter = adapter
+        self.replies = replies
+        self.sources = Sources(adapter)
         self.simulator: Any = None
         self.run: Any = None
 
-    def answer(self, header: dict[str, Any], arrays: list[Any]) -> bytes:
-        """Return the reply to a request: its result, or the error of the adapter."""
+    def answer(self, header: dict[str, Any], arrays: list[Any]) -> None:
+        """Reply to a request: send its result, or the error of the adapter."""
         verbs = {"describe": self.describe, "start": self.start, "advance": self.advance}
         try:
             reply, results = verbs[header["verb"]](header, arrays)
         except Exception as error:
             # Whatever an adapter raises is a result of the measurement: the reason of a cell.
             LOGGER.exception("the adapter raised")
-            reply = {"error": reason_of(error)}
+            reply = {"error": reason_of(error, self.adapter)}
             results = []
         reply["cpu"] = time.process_time()
-        return bytes(self.wire.encoded(reply, results))
+        reply["sources"] = self.sources.additions()
+        self.send(reply, results)
+
+    def send(self, header: dict[str, Any], arrays: list[Any]) -> None:
+        """Send a message to the measurement."""
+        self.replies.write(self.wire.encoded(header, arrays))
+        self.replies.flush()
 
     def describe(self, header: dict[str, Any], arrays: list[Any]) -> tuple[Any, list[Any]]:
         """Import the adapter, and return its description of itself."""
         # An adapter may import files beside it. They come last: an adapter often has the name of
         # the simulator that it imports.
         sys.path.append(str(self.adapter.parent))
-        self.simulator = load(self.adapter, "stickslip_adapter").Simulator
+        self.simulator = simulator_of(load(self.adapter, "stickslip_adapter"))
         settings = {name: dict(facts) for name, facts in self.simulator.settings.items()}
         return {
             "name": str(self.simulator.name),
@@ -104,11 +185,35 @@ class Host:
             self.run.set_gravity(gravity)
             self.run.step()
             frames.append(self.positions())
+            # A step that hangs is then known by its number.
+            self.send({"ended": True}, [])
         return {}, [np.stack(frames)]
 
     def positions(self) -> Any:
         """Return a copy of the positions: a simulator may hand out its own array."""
         return np.array(self.run.positions(), dtype=np.float64)
+
+
+def simulator_of(module: Any) -> Any:
+    """Return the class of an adapter.
+
+    Raises:
+        RuleError: It has another name, or misses an attribute.
+    """
+    simulator = getattr(module, "Simulator", None)
+    if simulator is None:
+        classes = [
+            name
+            for name, value in vars(module).items()
+            if isinstance(value, type) and value.__module__ == module.__name__
+        ]
+        raise RuleError(
+            f"adapter: must define the class Simulator, got {', '.join(classes) or 'no class'}"
+        )
+    missing = [name for name in REQUIRED if not hasattr(simulator, name)]
+    if missing:
+        raise RuleError(f"adapter: the class Simulator must have {', '.join(missing)}")
+    return simulator
 
 
 def read_exactly(stream: BinaryIO, size: int) -> bytes:
@@ -126,12 +231,11 @@ def main() -> None:
     os.dup2(2, 1)
     # Files of this package must not hide modules of the simulator.
     sys.path[:] = [place for place in sys.path if Path(place or ".").resolve() != FOLDER]
-    host = Host(Path(sys.argv[1]))
+    host = Host(Path(sys.argv[1]), replies)
     requests = sys.stdin.buffer
     while True:
         header, arrays = host.wire.read_message(lambda size: read_exactly(requests, size))
-        replies.write(host.answer(header, arrays))
-        replies.flush()
+        host.answer(header, arrays)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,14 @@ from typing import Self
 import numpy as np
 
 from stickslip_measure.contract import Floats, Rod, Sheet
-from stickslip_measure.process import AdapterError, AdapterProcess, Description, Program, Simulation
+from stickslip_measure.process import (
+    PATIENCE,
+    AdapterError,
+    AdapterProcess,
+    Description,
+    Program,
+    Simulation,
+)
 
 GRAVITY = 9.81
 """Acceleration of gravity [m/s^2]."""
@@ -88,7 +95,7 @@ class Experiment:
     measure: Callable[["Laboratory", int], Reading] = field(repr=False)
 
     @property
-    def default(self) -> int:
+    def middle(self) -> int:
         """The resolution whose error stands on the page."""
         return self.cells[len(self.cells) // 2]
 
@@ -105,6 +112,7 @@ class Laboratory:
         budget: Limit of the CPU time of all scenes together [s].
         softer: Factor on the bending stiffness of each scene, which calibrates a simulator whose
             own is off.
+        patience: Share of `seconds` that a single step may take.
     """
 
     def __init__(
@@ -116,6 +124,7 @@ class Laboratory:
         seconds: float,
         budget: float = math.inf,
         softer: float = 1.0,
+        patience: float = PATIENCE,
     ) -> None:
         self.program = program
         self.description = description
@@ -124,6 +133,7 @@ class Laboratory:
         self.seconds = seconds
         self.budget = budget
         self.softer = softer
+        self.patience = patience
         self.processes: list[AdapterProcess] = []
 
     def __enter__(self) -> Self:
@@ -143,6 +153,14 @@ class Laboratory:
         """CPU time of all processes [s]."""
         return sum(process.cpu for process in self.processes)
 
+    @property
+    def sources(self) -> dict[str, str]:
+        """Digests of the files that decide the results, by path."""
+        sources = dict(self.description.sources)
+        for process in self.processes:
+            sources |= process.sources
+        return sources
+
     def open(self, scene: Sheet | Rod) -> Simulation:
         """Start a scene.
 
@@ -153,7 +171,7 @@ class Laboratory:
         for process in self.processes:
             process.close()
         left = self.budget - self.cpu
-        process = AdapterProcess(self.program, self.log, self.seconds, left)
+        process = AdapterProcess(self.program, self.log, self.seconds, left, self.patience)
         self.processes.append(process)
         return Simulation(process, scene, self.setting)
 

@@ -90,7 +90,7 @@ def representative(cells: Sequence[Cell], experiment: Experiment) -> Cell | None
     reason says more than that of a cell that was not run.
     """
     at_most = sorted(
-        (c for c in cells if c.experiment == experiment.name and c.cells <= experiment.default),
+        (c for c in cells if c.experiment == experiment.name and c.cells <= experiment.middle),
         key=lambda cell: cell.cells,
     )
     measured = [cell for cell in at_most if cell.state == MEASURED]
@@ -99,7 +99,7 @@ def representative(cells: Sequence[Cell], experiment: Experiment) -> Cell | None
 
 def bracketed(text: str, cell: Cell, experiment: Experiment) -> str:
     """Return a text in brackets if its cell is coarser than the default resolution."""
-    return text if cell.cells == experiment.default else f"({text})"
+    return text if cell.cells == experiment.middle else f"({text})"
 
 
 def overview(rows: Mapping[Row, Sequence[Cell]]) -> str:
@@ -214,7 +214,7 @@ def resolution_entries(experiment: Experiment, measured: Sequence[Cell]) -> str:
         else:
             entries.append(f"<td>{cell.value:.5g}</td>")
     entries.append(limit_entries(measured))
-    cell = by_cells.get(experiment.default)
+    cell = by_cells.get(experiment.middle)
     entries.append(f"<td>{error_text(cell, experiment) if cell is not None else '–'}</td>")
     entries.append(f"<td>{sum(cell.cpu for cell in measured):.1f}</td>")
     return "".join(entries)
@@ -297,7 +297,7 @@ def conditions_text(cells: Sequence[Cell]) -> str:
     limits = " or ".join(f"{budget:g}" for budget in budgets)
     return (
         f"Measured on {' and '.join(dates)} on {' and '.join(machines)}, at a load of "
-        f"{min(loads):g} to {max(loads):g}, with at most {limits} s of CPU time for a cell."
+        f"{min(loads):g} to {max(loads):g}, with at most {limits} s of CPU time for a result."
     )
 
 

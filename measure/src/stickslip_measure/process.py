@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, ClassVar, Self
@@ -21,7 +21,22 @@ from stickslip_measure.contract import Floats, Rod, Sheet
 HOST = Path(__file__).with_name("host.py")
 
 FRAMES_AT_ONCE = 16
-"""Steps in a request: few, so that a simulator that is slow differs from one that hangs."""
+"""Steps in a request."""
+
+PATIENCE = 0.5
+"""Share of the time limit that a single answer may take: an import, a set-up or a step.
+
+A scene has more steps than two, so it could not end in time with such a step.
+"""
+
+STUCK = 100.0
+"""Time of a step over that of the longest step before, from which on it does not end.
+
+It decides only when the time limit is over, between a simulator that is slow and one that hangs.
+"""
+
+STUCK_LEAST = 1.0
+"""Least time of such a step [s]: a busy machine may delay any step."""
 
 LOG_LINES = 3
 """Number of last lines of a crashed process that its reason quotes."""
@@ -58,7 +73,7 @@ class CrashError(AdapterError):
 
 
 class HangError(AdapterError):
-    """No step ended in the time limit."""
+    """A step, a set-up or an import did not end."""
 
     state = "hangs"
 
@@ -103,6 +118,12 @@ class Description:
     damps: bool
     python: str
     numpy: str
+    sources: Mapping[str, str] = field(default_factory=dict)
+    """Digests of the files that its import loads and that are not installed, by path."""
+
+
+class LateError(Exception):
+    """An answer does not come in time."""
 
 
 class AdapterProcess:
@@ -113,17 +134,34 @@ class AdapterProcess:
         log: File for everything that the process prints.
         seconds: Time limit of the whole process [s].
         budget: Limit of its CPU time [s], which does not depend on other programs.
+        patience: Share of `seconds` that a single answer may take.
     """
 
     def __init__(
-        self, program: Program, log: Path, seconds: float, budget: float = math.inf
+        self,
+        program: Program,
+        log: Path,
+        seconds: float,
+        budget: float = math.inf,
+        patience: float = PATIENCE,
     ) -> None:
         self.log = log
         self.seconds = seconds
         self.budget = budget
-        self.deadline = time.monotonic() + seconds
+        self.patience = patience * seconds
+        """Longest time of a single answer [s]."""
+        now = time.monotonic()
+        self.deadline = now + seconds
         self.cpu = 0.0
         """CPU time of the process at its last reply [s]."""
+        self.sources: dict[str, str] = {}
+        """Digests of the files that it imported and that are not installed, by path."""
+        self.steps = 0
+        """Steps that have ended."""
+        self.longest = 0.0
+        """Time of the longest of them [s]."""
+        self._begun = now
+        """When the last wait began: for a step, or for another answer."""
         with log.open("wb") as output:
             try:
                 self._process = subprocess.Popen(
@@ -175,9 +213,10 @@ class AdapterProcess:
         """Return the reply to a request.
 
         Raises:
-            AdapterError: `failure` for an exception of the adapter; or the process crashed or
-                hangs.
+            AdapterError: `failure` for an exception of the adapter; or the process crashed.
+            LateError: An answer did not come in time.
         """
+        self._begun = time.monotonic()
         try:
             self._requests.write(wire.encoded(header, arrays))
             self._requests.flush()
@@ -185,17 +224,42 @@ class AdapterProcess:
             # The reason follows from how the process has ended.
             raise self._crash() from None
         reply, results = wire.read_message(self._read)
+        while "ended" in reply:
+            self._count_step()
+            reply, results = wire.read_message(self._read)
         self.cpu = float(reply.pop("cpu"))
+        self.sources.update(reply.pop("sources"))
         if "error" in reply:
             raise failure(reply["error"])
         return reply, results
 
+    @property
+    def waited(self) -> float:
+        """Time since the last step ended, or since the request [s]."""
+        return time.monotonic() - self._begun
+
+    @property
+    def waited_text(self) -> str:
+        """The time that was waited, as a message has it."""
+        return f"{round(self.waited, 1):g}"
+
+    @property
+    def is_stuck(self) -> bool:
+        """Whether the answer that is late does not come at all, as far as one can tell."""
+        limit = max(STUCK * self.longest, STUCK_LEAST) if self.steps else math.inf
+        return self.waited >= min(self.patience, limit)
+
+    def _count_step(self) -> None:
+        self.longest = max(self.longest, self.waited)
+        self.steps += 1
+        self._begun = time.monotonic()
+
     def _read(self, size: int) -> bytes:
         parts = bytearray()
         while len(parts) < size:
-            left = self.deadline - time.monotonic()
+            left = min(self.deadline, self._begun + self.patience) - time.monotonic()
             if left <= 0.0 or not self._selector.select(left):
-                raise HangError(f"no answer within {self.seconds:g} s")
+                raise LateError
             part = os.read(self._replies.fileno(), size - len(parts))
             # An open pipe has something to read, so this one has been closed.
             if not part:
@@ -220,11 +284,14 @@ def describe(program: Program, log: Path, seconds: float) -> Description:
         AdapterError: It cannot be imported, or lacks an attribute.
     """
     with AdapterProcess(program, log, seconds) as process:
-        return _described(process)
+        return replace(_described(process), sources=process.sources)
 
 
 def _described(process: AdapterProcess) -> Description:
-    reply, _ = process.request({"verb": "describe"}, [], SetupError)
+    try:
+        reply, _ = process.request({"verb": "describe"}, [], SetupError)
+    except LateError as error:
+        raise HangError(f"its import did not end within {process.waited_text} s") from error
     return Description(**{**reply, "capabilities": frozenset(reply["capabilities"])})
 
 
@@ -246,7 +313,12 @@ class Simulation:
         self.adapter = _described(process)
         header, arrays = wire.from_scene(scene)
         request = {"verb": "start", "scene": header, "setting": setting}
-        reply, (positions,) = process.request(request, arrays, SetupError)
+        try:
+            reply, (positions,) = process.request(request, arrays, SetupError)
+        except LateError as error:
+            raise HangError(
+                f"its constructor did not end within {process.waited_text} s"
+            ) from error
         self.frame = float(reply["frame"])
         """Time of a step [s]."""
         self.time = 0.0
@@ -290,21 +362,15 @@ class Simulation:
         parts = []
         for begin in range(0, len(gravity), FRAMES_AT_ONCE):
             batch = np.ascontiguousarray(gravity[begin : begin + FRAMES_AT_ONCE], dtype=float)
-            parts.append(self._advance(batch, begin, len(gravity)))
+            parts.append(self._advance(batch))
         return np.concatenate(parts)
 
-    def _advance(self, batch: Floats, done: int, total: int) -> Floats:
+    def _advance(self, batch: Floats) -> Floats:
         request = {"verb": "advance", "damping": self.damping}
         try:
             _, (frames,) = self._process.request(request, [batch], StepError)
-        except HangError as error:
-            # Steps before this request have ended, so the simulator works, only slowly.
-            if self.time > 0.0:
-                raise SlowError(
-                    f"{self._process.seconds:g} s were over after {self.time:.3g} s of the scene "
-                    f"({done} of {total} steps of this part)"
-                ) from error
-            raise HangError(f"no step ended within {self._process.seconds:g} s") from error
+        except LateError as error:
+            raise self._late() from error
         self.time += len(batch) * self.frame
         shape = (len(batch), *self.positions.shape)
         if frames.shape != shape:
@@ -313,11 +379,25 @@ class Simulation:
         self.positions = frames[-1]
         if self._process.cpu > self._process.budget:
             raise SlowError(
-                f"the {self._process.budget:.0f} CPU s that the cell had left were over after "
-                f"{self.time:.3g} s of the scene "
-                f"({done + len(batch)} of {total} steps of this part)"
+                "the limit of CPU time (--budget) was reached when the scene was at "
+                f"{self.time:.3g} s, after {self._process.steps} steps"
             )
         return np.asarray(frames)
+
+    def _late(self) -> HangError | SlowError:
+        """Return why a step is late: it does not end, or all steps together take too long."""
+        steps = self._process.steps
+        place = f"{steps * self.frame:.3g} s"
+        if self._process.is_stuck:
+            longest = f"; the longest step before it took {self._process.longest:.2g} s"
+            return HangError(
+                f"step {steps + 1} of the scene, which begins at {place}, did not end within "
+                f"{self._process.waited_text} s{longest if steps else ''}"
+            )
+        return SlowError(
+            f"the time limit of {self._process.seconds:g} s (--timeout) was over when the scene "
+            f"was at {place}, after {steps} steps"
+        )
 
     def rest(self, seconds: float, gravity: Floats) -> Floats:
         """Advance by a time under constant gravity (3,); return positions (N, V, 3) [m]."""

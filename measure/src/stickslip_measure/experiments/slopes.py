@@ -328,6 +328,7 @@ def creep(laboratory: Laboratory, cells: int) -> Reading:
     slope = np.tan(HOLD * np.arctan(MU))
     frames = simulation.advance(size[:, None] * tilted(np.array(slope)))
     moved = slid(frames, start, scene.sheet, 0)
+    # The larger of two components, as in the protocol `inclined-plane`.
     drift = float(np.abs(frames[-1] - start)[:, :2].max())
     nudge = nudged(simulation, 0)
     # A sheet that held may have been asleep, and one that crept may have fallen asleep.
@@ -407,11 +408,12 @@ EXPERIMENTS = (
         "creep",
         "Creep at 90 % of the angle of slip",
         "no motion in 10 s",
-        "largest displacement in 10 s",
+        "largest displacement of a vertex along x or y after 10 s; the curve is the mean distance "
+        "down the slope",
         "mm",
         frozenset({"floor"}),
         (5, 10, 20),
-        _TIME,
+        ("time [s]", "mean distance down the slope [mm]"),
         creep,
     ),
     Experiment(

@@ -21,4 +21,6 @@ def measure() -> None:
 
     Passes all arguments on to `stickslip-measure`. It needs no coordinator.
     """
-    run_program(_PROGRAM, click.get_current_context().args)
+    # Its usage and its errors then name the command that the user typed.
+    variables = {"STICKSLIP_MEASURE_PROGRAM": "stickslip measure"}
+    run_program(_PROGRAM, click.get_current_context().args, variables)
