@@ -13,15 +13,20 @@ from stickslip_measure.page import overview, rows_of
 ROOT = Path(__file__).parents[1]
 
 
-@pytest.fixture(scope="module")
-def script() -> ModuleType:
-    """The script that writes page and guide."""
-    spec = spec_from_file_location("yardstick", ROOT / "benchmarks/yardstick.py")
+def loaded(name: str) -> ModuleType:
+    """Return a script of the folder `benchmarks`."""
+    spec = spec_from_file_location(name, ROOT / f"benchmarks/{name}.py")
     assert spec is not None
     assert spec.loader is not None
     module = module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope="module")
+def script() -> ModuleType:
+    """The script that writes page and guide."""
+    return loaded("yardstick")
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +42,12 @@ def test_the_guide_has_the_numbers_of_the_record(script: ModuleType, record: Any
 
 def test_the_page_has_the_numbers_of_the_record(script: ModuleType, record: Any) -> None:
     assert overview(rows_of(script.cells_of(record))) in script.PAGE.read_text()
+
+
+def test_the_guide_has_the_scenes_of_the_experiments() -> None:
+    scenes = loaded("yardstick_scenes")
+    guide = scenes.GUIDE.read_text()
+    assert scenes.completed(guide) == guide
 
 
 def test_every_experiment_was_attempted_on_every_simulator(script: ModuleType, record: Any) -> None:

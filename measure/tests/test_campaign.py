@@ -63,6 +63,20 @@ def test_a_lie_about_time_is_named(falling: Adapter, tmp_path: Path) -> None:
     assert "a second of its time is 0.800 s" in faults[0].evidence
 
 
+def test_a_lie_about_time_spoils_what_moves(falling: Adapter, tmp_path: Path) -> None:
+    # From the second step on, a step covers twice the time that it states.
+    liar = falling(step="self.x += 0; self.frame = 0.02")
+    cells = measured(liar, tmp_path, "kinetic-friction")
+    (fault,) = (each for each in findings(cells) if each.fault.startswith("steps cover"))
+    assert fault.spoiled == ("kinetic-friction",)
+    assert fault.text.endswith("because of this, values are wrong: kinetic-friction")
+    page = write_page(tmp_path).read_text()
+    assert 'title="because of this: steps cover another time than they state"' in page
+    # What no run has asked for is another thing than what the adapter cannot do.
+    assert 'data-column="pinch">not requested</td>' in page
+    assert 'data-column="verdict">not requested</td>' in page
+
+
 def test_drag_is_no_lie_about_time(falling: Adapter, tmp_path: Path) -> None:
     cells = measured(falling(step="self.v *= 0.97"), tmp_path)
     assert findings(cells)[0].fault == "something brakes a free fall"

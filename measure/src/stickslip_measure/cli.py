@@ -162,7 +162,7 @@ class Report:
         """Print the faults that the results show, row by row."""
         for row in sorted({cell.row for cell in self.cells}):
             for finding in findings([cell for cell in self.cells if cell.row == row]):
-                print_line(f"{row}: {finding.fault} ({finding.evidence})")
+                print_line(f"{row}: {finding.fault} ({finding.text})")
 
     def print_notes(self, folder: Path) -> None:
         """Print how to measure earlier results again, and where failures are explained."""

@@ -46,6 +46,16 @@ class Finding:
     fault: str
     evidence: str
 
+    spoiled: tuple[str, ...] = ()
+    """Experiments whose values are wrong because of it."""
+
+    @property
+    def text(self) -> str:
+        """The evidence, and what is wrong because of the fault."""
+        if not self.spoiled:
+            return self.evidence
+        return f"{self.evidence}; because of this, values are wrong: {', '.join(self.spoiled)}"
+
 
 Rows = dict[str, list[Cell]]
 """Cells of one row, by experiment."""
@@ -88,6 +98,7 @@ def clock(row: Rows) -> Finding | None:
         "steps cover another time than they state",
         f"a patch falls with {cell.value:.3f} g: a second of its time is "
         f"{max(cell.value, 0.0) ** 0.5:.3f} s",
+        tuple(name for name in experiments.MOTION if _is_wrong(row.get(name, []))),
     )
 
 
@@ -119,7 +130,10 @@ def clamp(row: Rows) -> Finding | None:
 
 
 def friction(row: Rows) -> Finding | None:
-    """Find a factor on friction."""
+    """Find a factor on friction, but for one that a wrong time explains."""
+    timing = clock(row)
+    if timing is not None and timing.spoiled:
+        return None
     return _factor(row, experiments.FRICTION, "friction")
 
 
@@ -161,6 +175,11 @@ RULES: tuple[Callable[[Rows], Finding | None], ...] = (
 def _only(row: Rows, name: str) -> Cell | None:
     cells = row.get(name, [])
     return cells[0] if cells else None
+
+
+def _is_wrong(cells: Sequence[Cell]) -> bool:
+    """Return whether the value of a resolution deviates."""
+    return any(cell.error is not None and abs(cell.error) > FACTOR for cell in cells)
 
 
 def _settled_value(cells: Sequence[Cell]) -> float:

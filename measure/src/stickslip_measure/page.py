@@ -13,7 +13,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from stickslip_measure import __version__, experiments
-from stickslip_measure.campaign import MEASURED, Cell, convergence, read_cells
+from stickslip_measure.campaign import CALIBRATED, MEASURED, Cell, convergence, read_cells
 from stickslip_measure.diagnosis import CREEP, findings, row_of
 from stickslip_measure.laboratory import Experiment
 
@@ -22,6 +22,9 @@ GOOD = 0.01
 
 FAIR = 0.05
 """Largest error of a cell that is marked as fair."""
+
+SPOILED = " †"
+"""Mark of a value that is wrong because of a fault that is named below the table."""
 
 STYLES = ("-", "--", ":", "-.")
 COLOURS = ("#1f6f8b", "#c2571a", "#4a7c2a", "#7b4fa3", "#a8324a", "#6b6b00")
@@ -84,7 +87,7 @@ def chosen(rows: Mapping[Row, Sequence[Cell]]) -> Iterator[Experiment]:
 
 
 def representative(cells: Sequence[Cell], experiment: Experiment) -> Cell | None:
-    """Return the cell that stands for an experiment: of the default resolution, if it has a value.
+    """Return the cell that stands for an experiment: of the middle resolution, if it has a value.
 
     Otherwise it is the finest of the coarser ones that have a value, or else the coarsest, whose
     reason says more than that of a cell that was not run.
@@ -98,7 +101,7 @@ def representative(cells: Sequence[Cell], experiment: Experiment) -> Cell | None
 
 
 def bracketed(text: str, cell: Cell, experiment: Experiment) -> str:
-    """Return a text in brackets if its cell is coarser than the default resolution."""
+    """Return a text in brackets if its cell is coarser than the middle resolution."""
     return text if cell.cells == experiment.middle else f"({text})"
 
 
@@ -128,7 +131,7 @@ def verdict(cells: Sequence[Cell]) -> str:
     creep = experiments.EXPERIMENTS["creep"]
     cell = representative(cells, creep)
     if cell is None:
-        return table_entry("verdict", "none", "not asked")
+        return table_entry("verdict", "none", absent(cells))
     if cell.value is None:
         # Only a simulator that sleeps has been found out: others gave no answer, and did not fail.
         mark, word = ("poor", "sleeps") if cell.state == "sleeps" else ("none", "no answer")
@@ -142,11 +145,22 @@ def entry(cells: Sequence[Cell], experiment: Experiment) -> str:
     """Return the error, or the reason why there is none."""
     cell = representative(cells, experiment)
     if cell is None:
-        return table_entry(experiment.name, "absent", "–")
+        return table_entry(experiment.name, "absent", absent(cells))
     if cell.state != MEASURED:
         return table_entry(experiment.name, "none", escape(cell.state), cell.reason)
     text = bracketed(error_text(cell, experiment), cell, experiment)
-    return table_entry(experiment.name, grade(cell, experiment), text)
+    causes = [fault.fault for fault in findings(cells) if experiment.name in fault.spoiled]
+    reason = ""
+    if causes:
+        text += SPOILED
+        reason = f"because of this: {', '.join(causes)}"
+    return table_entry(experiment.name, grade(cell, experiment), text, reason)
+
+
+def absent(cells: Sequence[Cell]) -> str:
+    """Return the word for an experiment that a row does not have."""
+    # Only bending is repeated with a calibrated bending stiffness.
+    return "–" if cells[0].row.endswith(CALIBRATED) else "not requested"
 
 
 def grade(cell: Cell, experiment: Experiment) -> str:
@@ -176,7 +190,7 @@ def finding_items(rows: Mapping[Row, Sequence[Cell]]) -> Iterator[str]:
     for (simulator, row), cells in rows.items():
         for finding in findings(cells):
             head = escape(f"{simulator}, {row}: {finding.fault}.")
-            yield f"<li><strong>{head}</strong> {escape(finding.evidence)}</li>"
+            yield f"<li><strong>{head}</strong> {escape(finding.text)}</li>"
 
 
 def section(experiment: Experiment, rows: Mapping[Row, Sequence[Cell]]) -> str:
@@ -208,7 +222,7 @@ def resolution_entries(experiment: Experiment, measured: Sequence[Cell]) -> str:
     for cells in experiment.cells:
         cell = by_cells.get(cells)
         if cell is None:
-            entries.append("<td>–</td>")
+            entries.append("<td>not requested</td>")
         elif cell.value is None:
             entries.append(f'<td class="reason">{escape(cell.state)}: {escape(cell.reason)}</td>')
         else:
@@ -363,10 +377,11 @@ a { color: inherit; }
 </head>
 <body>
 <h1>Who holds, and who creeps</h1>
-<p>Errors at the default resolution against closed forms: within 1 % green, within 5 % yellow.
-In brackets: of a coarser mesh, where the default one has no value.
-"Holds" is less than 0.1 mm in 10 s at 90 % of the angle of slip, awake. Made by
-stickslip-measure $version.</p>
+<p>Errors at the middle resolution against closed forms: within 1 % green, within 5 % yellow.
+In brackets: of a coarser mesh, where the middle one has no value.
+The verdict is that of creep: "holds" is less than 0.1 mm in 10 s at 90 % of the angle of slip,
+awake. "Not supported": the adapter lacks a capability. "Not requested": no run asked for it.
+†: wrong because of a fault named below. Made by stickslip-measure $version.</p>
 <table class="overview">
 $overview
 </table>

@@ -28,5 +28,8 @@ EXPERIMENTS: dict[str, Experiment] = {name: _BY_NAME[name] for name in _ORDER}
 FRICTION = _ORDER[:2] + _ORDER[3:8]
 """Experiments whose value is proportional to friction."""
 
+MOTION = ("incline-onset", "kinetic-friction", "stacked-incline", "capstan", "pull-out")
+"""Experiments whose value follows from a speed or an acceleration, and so from the time."""
+
 BENDING = ("cantilever", "lateral-buckling", "drape")
 """Experiments whose value is proportional to bending stiffness."""
