@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from stickslip_measure import experiments
 from stickslip_measure.campaign import Cell, Request, measure, read_cell
-from stickslip_measure.cli import main
+from stickslip_measure.cli import PROGRAM_VARIABLE, main
 from stickslip_measure.convergence import converged
 from stickslip_measure.diagnosis import findings
 from stickslip_measure.experiments import capstan, drape, slopes, strips
@@ -241,6 +241,17 @@ def test_a_run_without_a_value_says_where_the_tracebacks_are(
     assert 'adapter.py", line 20, in step' in log.read_text()
 
 
+@pytest.mark.parametrize("name", ["stickslip measure", "stickslip-measure"])
+def test_the_usage_names_the_command_of_the_user(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if name == "stickslip measure":
+        monkeypatch.setenv(PROGRAM_VARIABLE, name)
+    with pytest.raises(SystemExit):
+        main(["--timeout", "0"])
+    assert capsys.readouterr().err.startswith(f"usage: {name} [-h]")
+
+
 def test_faults_are_those_of_the_requested_experiments(
     falling: Adapter, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -248,6 +259,8 @@ def test_faults_are_those_of_the_requested_experiments(
     # It falls along the slope, too, and so creeps by metres.
     main(["--simulator", adapter, "--experiment", "creep", "--out", str(tmp_path)])
     assert "cloth creeps" in capsys.readouterr().out
+    # The curve goes up to the time of the value.
+    assert read_cell(tmp_path / "falling" / "default" / "creep-5.json").x[-1] == 10.0
     main(["--simulator", adapter, "--experiment", "kinetic-friction", "--out", str(tmp_path)])
     assert "cloth creeps" not in capsys.readouterr().out
 

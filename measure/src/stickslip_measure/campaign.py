@@ -161,7 +161,8 @@ def measure(request: Request, tell: Tell) -> Description:
     if not settings:
         raise SetupError(
             f"--setting: must be a row of the adapter's `settings` "
-            f"({', '.join(description.settings)}), got {', '.join(request.settings)}"
+            f"({', '.join(description.settings)}), got {', '.join(request.settings)}; add it "
+            "there, or leave --setting out"
         )
     folder = request.out / description.name
     folder.mkdir(exist_ok=True)

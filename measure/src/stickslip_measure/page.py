@@ -381,7 +381,8 @@ a { color: inherit; }
 In brackets: of a coarser mesh, where the middle one has no value.
 The verdict is that of creep: "holds" is less than 0.1 mm in 10 s at 90 % of the angle of slip,
 awake. "Not supported": the adapter lacks a capability. "Not requested": no run asked for it.
-†: wrong because of a fault named below. Made by stickslip-measure $version.</p>
+A dash: not repeated with calibrated bending. †: wrong because of a fault named below. Made by
+stickslip-measure $version.</p>
 <table class="overview">
 $overview
 </table>

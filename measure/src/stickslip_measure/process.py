@@ -134,7 +134,8 @@ class AdapterProcess:
         log: File for everything that the process prints.
         seconds: Time limit of the whole process [s].
         budget: Limit of its CPU time [s], which does not depend on other programs.
-        patience: Share of `seconds` that a single answer may take.
+        patience: Share of `seconds` that a step may take. Imports and constructors have
+            `PATIENCE`.
     """
 
     def __init__(
@@ -149,7 +150,7 @@ class AdapterProcess:
         self.seconds = seconds
         self.budget = budget
         self.patience = patience * seconds
-        """Longest time of a single answer [s]."""
+        """Longest time of a step [s]."""
         now = time.monotonic()
         self.deadline = now + seconds
         self.cpu = 0.0
@@ -162,6 +163,7 @@ class AdapterProcess:
         """Time of the longest of them [s]."""
         self._begun = now
         """When the last wait began: for a step, or for another answer."""
+        self._longest_wait = PATIENCE * seconds
         with log.open("wb") as output:
             try:
                 self._process = subprocess.Popen(
@@ -217,6 +219,8 @@ class AdapterProcess:
             LateError: An answer did not come in time.
         """
         self._begun = time.monotonic()
+        stepping = header["verb"] == "advance"
+        self._longest_wait = self.patience if stepping else PATIENCE * self.seconds
         try:
             self._requests.write(wire.encoded(header, arrays))
             self._requests.flush()
@@ -257,7 +261,7 @@ class AdapterProcess:
     def _read(self, size: int) -> bytes:
         parts = bytearray()
         while len(parts) < size:
-            left = min(self.deadline, self._begun + self.patience) - time.monotonic()
+            left = min(self.deadline, self._begun + self._longest_wait) - time.monotonic()
             if left <= 0.0 or not self._selector.select(left):
                 raise LateError
             part = os.read(self._replies.fileno(), size - len(parts))
