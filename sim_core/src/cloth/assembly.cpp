@@ -37,6 +37,23 @@ std::vector<std::vector<int>> grouped(const Fabrics& fabrics) {
   return groups;
 }
 
+// Half of the width of a difference over the logarithm of a factor: the error by the third
+// derivative is 1e-9, and that by rounding less.
+constexpr double log_factor_probe = 1e-4;
+
+Fabrics scaled(Fabrics fabrics, BendingNumber number, double factor) {
+  for (ClothProperties& fabric : fabrics.list) {
+    if (number == BendingNumber::softening) {
+      fabric.softening *= factor;
+      continue;
+    }
+    Eigen::Vector3d roots = Eigen::Vector3d::Ones();
+    roots[static_cast<int>(number)] = std::sqrt(factor);
+    fabric.rigidity = roots.asDiagonal() * fabric.rigidity * roots.asDiagonal();
+  }
+  return fabrics;
+}
+
 }  // namespace
 
 Bending::Bending(const ClothMesh& mesh, const std::vector<Stencil>& stencils,
@@ -150,6 +167,8 @@ Assembly::Assembly(const ClothKernel& kernel_in, const ClothMesh& mesh, const Fa
       mass(numbering.nodes, 0.0),
       own_damping(numbering.nodes, 0.0),
       gradient(4L * numbering.nodes, 0.0),
+      mesh_(mesh),
+      fabrics_(fabrics),
       membrane_(mesh, numbering, fabrics),
       bending_(mesh, stencils, fabrics, numbering, numbering.bending),
       compact_bending_(mesh, compact_stencils, fabrics, numbering, numbering.compact_bending),
@@ -215,6 +234,30 @@ void Assembly::gradient_of(Energy energy, const Buffer<double>& x, Buffer<double
   if (energy != Energy::membrane) {
     kernel.bending(bending_.data(), x.data(), out.data(), nullptr, nullptr);
   }
+}
+
+Bending Assembly::bending_with(const Fabrics& fabrics) const {
+  return Bending(mesh_, bending_stencils(mesh_, fabrics), fabrics, numbering, numbering.bending);
+}
+
+const BendingDifference& Assembly::difference_by(BendingNumber number) {
+  std::unique_ptr<BendingDifference>& known = differences_[static_cast<int>(number)];
+  if (!known) {
+    const double factor = std::exp(log_factor_probe);
+    known.reset(new BendingDifference{bending_with(scaled(fabrics_, number, factor)),
+                                      bending_with(scaled(fabrics_, number, 1.0 / factor))});
+  }
+  return *known;
+}
+
+void Assembly::gradient_by(BendingNumber number, const Buffer<double>& x, Buffer<double>& out) {
+  const BendingDifference& difference = difference_by(number);
+  Buffer<double> smaller(out.size(), 0.0);
+  std::fill(out.begin(), out.end(), 0.0);
+  kernel.bending(difference.larger.data(), x.data(), out.data(), nullptr, nullptr);
+  kernel.bending(difference.smaller.data(), x.data(), smaller.data(), nullptr, nullptr);
+  for (std::size_t k = 0; k < out.size(); ++k)
+    out[k] = (out[k] - smaller[k]) / (2.0 * log_factor_probe);
 }
 
 void Assembly::assemble_bending() {

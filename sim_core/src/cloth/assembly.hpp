@@ -1,7 +1,9 @@
 // Energies of a sheet, their gradient, and the matrix of Newton's method.
 #pragma once
 
+#include <array>
 #include <cstdint>
+#include <memory>
 #include <vector>
 
 #include "cloth/constants.hpp"
@@ -28,6 +30,16 @@ class Bending {
   std::vector<double> area_, spacing2_, rigidity_;
   std::vector<SofteningData> softening_;
   BendingData data_{};
+};
+
+// A number of fabrics that changes a part of their bending. With the factors a, b and c of warp,
+// weft and twist the rigidity is S D S, S = diag(sqrt a, sqrt b, sqrt c).
+enum class BendingNumber { warp, weft, twist, softening };
+constexpr int bending_numbers = 4;
+
+// The bending of a cloth with a number of its fabrics a little larger, and a little smaller.
+struct BendingDifference {
+  Bending larger, smaller;
 };
 
 // Triangles in groups of one fabric, and the law of each fabric.
@@ -83,6 +95,9 @@ class Assembly {
   enum class Energy { all, membrane, bending };
   // Sets `out` (nodes, 4) to the gradient of an energy at x, N, and changes nothing else.
   void gradient_of(Energy energy, const Buffer<double>& x, Buffer<double>& out) const;
+  // Sets `out` (nodes, 4) to the derivative of the gradient at x by the logarithm of a factor of a
+  // number of all fabrics, N, and changes nothing that can be seen.
+  void gradient_by(BendingNumber number, const Buffer<double>& x, Buffer<double>& out);
   // From now on stretching lags behind what it is at x by this fraction, none if 0: see
   // kernels/membrane.hpp.
   void set_lagged_stretch(const Buffer<double>& x, double fraction) {
@@ -102,9 +117,16 @@ class Assembly {
  private:
   void assemble_bending();
   void reserve_folds();
+  const BendingDifference& difference_by(BendingNumber number);
+  Bending bending_with(const Fabrics& fabrics) const;
+
+  const ClothMesh mesh_;
+  const Fabrics fabrics_;
 
   Membrane membrane_;
   Bending bending_, compact_bending_;
+  // By number, made when first asked for.
+  std::array<std::unique_ptr<BendingDifference>, bending_numbers> differences_;
   std::vector<float> rigidity_scale_;  // (triangles): 1 over the largest of its fabric, 1/(N m)
   std::vector<int> bending_diagonal_, membrane_diagonal_;  // slots
   Buffer<float> scalars_, blocks_, diagonal_;

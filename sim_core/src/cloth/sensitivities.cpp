@@ -131,6 +131,12 @@ void Sensitivities::differentiate_by(const SensitivityTerm& term, const Step& st
     case Kind::stretching:
       assembly_.gradient_of(Assembly::Energy::membrane, step.x, by_term_);
       return;
+    case Kind::bending_warp:
+    case Kind::bending_weft:
+    case Kind::bending_twist:
+    case Kind::softening:
+      assembly_.gradient_by(term.bending_number(), step.x, by_term_);
+      return;
     case Kind::density: {
       const Inertia& inertia = step.inertia;
       for (int i = 0; i < assembly_.numbering.free_nodes; ++i) {
@@ -142,10 +148,7 @@ void Sensitivities::differentiate_by(const SensitivityTerm& term, const Step& st
       }
       return;
     }
-    case Kind::friction_of_body:
-    case Kind::friction_of_pair:
-    case Kind::static_friction_of_body:
-    case Kind::static_friction_of_pair:  // contacts bring these in
+    default:  // contacts bring friction in
       return;
   }
 }

@@ -44,6 +44,11 @@ struct SensitivityTerm {
     // first two are then. Only what holds depends on them: no position does until it slips.
     static_friction_of_body = 5,
     static_friction_of_pair = 6,
+    // Logarithms of factors of sheet `first`: see BendingNumber.
+    bending_warp = 7,
+    bending_weft = 8,
+    bending_twist = 9,
+    softening = 10,
   };
   Kind kind;
   int first = -1, second = -1;
@@ -54,6 +59,11 @@ struct SensitivityTerm {
   }
   bool is_friction_of_pair() const {
     return kind == Kind::friction_of_pair || kind == Kind::static_friction_of_pair;
+  }
+  // Of a part of bending; the kinds of these have the order of the numbers.
+  BendingNumber bending_number() const {
+    return static_cast<BendingNumber>(static_cast<int>(kind) -
+                                      static_cast<int>(Kind::bending_warp));
   }
   // Whether a contact with this cone bears friction by the term.
   bool is_of(Cone cone) const {

@@ -136,6 +136,14 @@ class TestOwnFabric:
         assert other.name == "gray-interlock, density x 2, stretching x 0.5, bending x 3"
         assert base.scaled().name == base.name
 
+    def test_parts_of_bending_are_scaled(self) -> None:
+        base = dataclasses.replace(fabric("gray-interlock"), softening=300.0)
+        other = base.scaled(bending_ratio=4.0, bending_twist=3.0, softening=2.0)
+        warp, weft, twist = (np.diag(other.rigidity) / np.diag(base.rigidity)).tolist()
+        assert (warp, weft, twist) == pytest.approx((2.0, 0.5, 3.0))
+        assert other.softening == 600.0
+        assert fabric("gray-interlock").scaled(softening=2.0).softening is None
+
     def test_scene_takes_it(self) -> None:
         """The same numbers give the same motion, whether by name or not."""
         named = cloth_drag.scene("gray-interlock", 0.5, mesh=7, frames=4).run()

@@ -102,14 +102,37 @@ class Fabric:
         object.__setattr__(self, "rigidity", d)
 
     def scaled(
-        self, *, density: float = 1.0, stretching: float = 1.0, bending: float = 1.0
+        self,
+        *,
+        density: float = 1.0,
+        stretching: float = 1.0,
+        bending: float = 1.0,
+        bending_ratio: float = 1.0,
+        bending_twist: float = 1.0,
+        softening: float = 1.0,
     ) -> "Fabric":
         """Return a fabric whose numbers are the numbers of this one times factors.
+
+        Args:
+            density: Factor of the mass per area.
+            stretching: Factor of the stretching stiffness.
+            bending: Factor of all of the bending stiffness.
+            bending_ratio: Factor of the rigidity along the warp over that along the weft. Their
+                product stays.
+            bending_twist: Factor of the rigidity of twist.
+            softening: Factor of the curvature of softening. It changes nothing without softening.
 
         Raises:
             ValueError: A factor is not positive, or a product breaks its rule.
         """
-        factors = {"density": density, "stretching": stretching, "bending": bending}
+        factors = {
+            "density": density,
+            "stretching": stretching,
+            "bending": bending,
+            "bending_ratio": bending_ratio,
+            "bending_twist": bending_twist,
+            "softening": softening,
+        }
         for name, factor in factors.items():
             if not (np.isfinite(factor) and factor > 0.0):
                 raise ValueError(f"{name}: must be a finite factor > 0, got {factor}")
@@ -117,13 +140,15 @@ class Fabric:
         changed = "".join(
             f", {name} x {factor:g}" for name, factor in factors.items() if factor != 1.0
         )
+        # S D S stays positive definite, and with it warp, weft and twist have their factors.
+        roots = np.array([bending_ratio**0.25, bending_ratio**-0.25, bending_twist**0.5])
         return Fabric(
             self.name + changed,
             self.density * density,
             self.stretching * stretching,
-            self.rigidity * bending,
+            self.rigidity * bending * np.outer(roots, roots),
             self.damping,
-            self.softening,
+            None if self.softening is None else self.softening * softening,
         )
 
 

@@ -15,7 +15,15 @@ import numpy as np
 
 from stickslip_sim_core.arrays import Floats
 
-FabricProperty: TypeAlias = Literal["bending", "stretching", "density"]
+FabricProperty: TypeAlias = Literal[
+    "bending",
+    "stretching",
+    "density",
+    "bending_warp",
+    "bending_weft",
+    "bending_twist",
+    "softening",
+]
 FrictionKind: TypeAlias = Literal[
     "friction_of_body", "friction_of_pair", "static_friction_of_body", "static_friction_of_pair"
 ]
@@ -30,6 +38,10 @@ _NUMBERS: dict[Kind, int] = {
     "density": 4,
     "static_friction_of_body": 5,
     "static_friction_of_pair": 6,
+    "bending_warp": 7,
+    "bending_weft": 8,
+    "bending_twist": 9,
+    "softening": 10,
 }
 
 TermTuple: TypeAlias = tuple[int, int, int, float]

@@ -256,6 +256,10 @@ def family(
 ) -> SceneFamily:
     """Return the scenes of dragged cloth that differ in friction, fabric and speed.
 
+    They have the arguments below as parameters, and three more factors, which are 1 at first:
+    `bending_ratio`, of the rigidity along the warp over that along the weft; `bending_twist`, of
+    that of twist; and `softening`, of the curvature by which bending softens.
+
     Args:
         material: One of `fabric_names()`, or a fabric.
         mu: Coefficient of friction between cloth and floor, 0 ... 10.
@@ -274,17 +278,24 @@ def family(
     )
 
     def make(values: Mapping[str, float], hanging: Hang) -> Scene:
-        factors = {name: values[name] for name in ("density", "bending", "stretching")}
         varied = replace(
             drag,
-            fabric=cloth_fabric.scaled(**factors),
+            fabric=cloth_fabric.scaled(**{name: values[name] for name in of_fabric}),
             mu=values["mu"],
             static_ratio=values["static_ratio"],
             speed=values["speed"],
         )
         return varied.scene(hanging)
 
-    factors = {"density": density, "bending": bending, "stretching": stretching, "speed": speed}
+    of_fabric = {
+        "density": density,
+        "bending": bending,
+        "stretching": stretching,
+        "bending_ratio": 1.0,
+        "bending_twist": 1.0,
+        "softening": 1.0,
+    }
+    factors = {**of_fabric, "speed": speed}
     return SceneFamily(
         {
             "mu": SceneParameter(mu, 0.0, MU_MAX / static_ratio),

@@ -183,13 +183,30 @@ class Comparison:
     def _factors(self, low: Fabric, high: Fabric) -> dict[FabricProperty, float]:
         if low.damping != high.damping:
             self._refuse("the damping of a fabric")
-        if low.softening != high.softening:
-            self._refuse("the softening of a fabric")
         return {
             "density": high.density / low.density,
-            "bending": self._factor(low.rigidity, high.rigidity, "bending"),
             "stretching": self._factor(low.stretching, high.stretching, "stretching"),
+            "softening": self._softening_factor(low.softening, high.softening),
+            **self._bending_factors(low.rigidity, high.rigidity),
         }
+
+    def _softening_factor(self, low: float | None, high: float | None) -> float:
+        if (low is None) != (high is None):
+            self._refuse("whether a fabric softens")
+        return 1.0 if low is None or high is None else high / low
+
+    def _bending_factors(self, low: Floats, high: Floats) -> dict[FabricProperty, float]:
+        """Return one factor of all of the rigidity, or those of its warp, weft and twist."""
+        factors = np.diag(high) / np.diag(low)
+        roots = np.sqrt(factors)
+        if not np.allclose(high, low * np.outer(roots, roots), rtol=SAME, atol=0.0):
+            self._refuse(
+                "numbers of the bending of a fabric, and not by factors of warp, weft and twist"
+            )
+        if np.allclose(factors, factors[0], rtol=SAME, atol=0.0):
+            return {"bending": float(factors[0])}
+        warp, weft, twist = factors.tolist()
+        return {"bending_warp": warp, "bending_weft": weft, "bending_twist": twist}
 
     def _factor(self, low: Floats, high: Floats, numbers: str) -> float:
         """Return the factor between two tables of numbers of a fabric."""
