@@ -15,6 +15,7 @@ the values, and the standard deviations have this share. SciPy comes with the ex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
+from itertools import product
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
@@ -146,6 +147,8 @@ class Minimum(NamedTuple):
     is_explained: bool
     """Whether the search converged, and noise explains what the run leaves."""
     message: str
+    family: int = 0
+    """Number of the family of scenes that was searched."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,6 +185,9 @@ class Fit:
 
     searches: Sequence[Minimum]
     """Where the search from each start ended."""
+
+    family: int
+    """Number of the family of scenes of the best minimum."""
 
     is_explained: bool
     """Whether that search converged, and noise explains what the run leaves."""
@@ -226,7 +232,7 @@ class Fit:
 
 
 def fit(
-    scenes: SceneFamily,
+    scenes: SceneFamily | Sequence[SceneFamily],
     observations: Sequence[Observation],
     parameters: Sequence[str],
     *,
@@ -239,7 +245,9 @@ def fit(
     """Fit parameters of a scene to observations.
 
     Args:
-        scenes: Scenes that differ in the parameters.
+        scenes: Scenes that differ in the parameters. Several families differ in what no parameter
+            sets, such as the seed that decides to which side cloth falls: each start is that of
+            each family in turn.
         observations: Observations with their noise.
         parameters: Names of the parameters to fit.
         start: Values to start from. Parameters without one start from the values of `scenes`.
@@ -247,7 +255,8 @@ def fit(
         priors: Distributions of some parameters before the fit. Each counts as one more
             observation.
         multistart: Number of starts. Those after the first are drawn from the bounds, and are used
-            while the observations are not explained by their noise.
+            while the observations are not explained by their noise. With several families it is
+            their number for each.
         seed: Seed of the starts.
 
     Raises:
@@ -256,17 +265,25 @@ def fit(
             at each start a parameter has no effect or the run is not valid.
     """
     check_scipy()
-    search = _Search(scenes, observations, parameters, bounds or {}, priors or {})
-    starts = search.starts(start or {}, multistart, seed)
+    families = [scenes] if isinstance(scenes, SceneFamily) else scenes
+    if not families:
+        raise ValueError("scenes: must be at least one family, got none")
+    by_family = [
+        _Search(family, observations, parameters, bounds or {}, priors or {}) for family in families
+    ]
+    starts = [search.starts(start or {}, multistart, seed) for search in by_family]
     searches: list[Minimum] = []
-    for values in starts:
-        searches.append(search.minimum(values))
+    # All families have had their first start before one has its second.
+    for turn, number in product(range(multistart), range(len(families))):
+        minimum = by_family[number].minimum(starts[number][turn])
+        searches.append(minimum._replace(family=number))
         if searches[-1].is_explained:
             break
     # A search that converged is better than one that did not, whatever it leaves.
     best = min(searches, key=lambda minimum: (not minimum.is_explained, minimum.mean_square))
     if not np.isfinite(best.mean_square):
         raise ValueError(best.message)
+    search = by_family[best.family]
     by_noise = search.covariance(best)
     by_steps = search.shift_by_steps(best)
     covariance = by_noise + np.nan_to_num(np.outer(by_steps, by_steps))
@@ -278,6 +295,7 @@ def fit(
         best.mean_square,
         best.converged,
         searches,
+        best.family,
         best.is_explained,
         _count_minima(searches),
     )

@@ -386,6 +386,24 @@ def test_fit_goes_on_where_the_first_start_sticks(scenes: SceneFamily, run: Clot
     assert answer.warning == ""
 
 
+def test_fit_goes_on_with_another_family(scenes: SceneFamily, run: ClothRun) -> None:
+    def uphill(values: Mapping[str, float], hang: Hang) -> Scene:
+        scene = sliding_sheet(values, hang)
+        up = np.tile(GRAVITY * np.array([-np.sin(SLOPE), 0.0, -np.cos(SLOPE)]), (25, 1))
+        bodies = [plane(values["mu"])]
+        return replace(scene, motion=lambda _time: (up, bodies))
+
+    other_way = replace(scenes, make=uphill)
+    answer = fit([other_way, scenes], [vertices(run)], ["mu"], multistart=1)
+    assert answer.family == 1
+    assert [search.family for search in answer.searches] == [0, 1]
+    assert abs(answer.values["mu"] - TRUTH["mu"]) < 4.0 * answer.deviations["mu"]
+    # The right one comes first: no other is searched.
+    assert len(fit([scenes, other_way], [vertices(run)], ["mu"]).searches) == 1
+    with pytest.raises(ValueError, match="scenes: must be at least one family, got none"):
+        fit([], [vertices(run)], ["mu"])
+
+
 def test_warning_of_one_search_is_in_the_singular(scenes: SceneFamily, run: ClothRun) -> None:
     answer = fit(scenes, [vertices(run)], ["mu"], bounds={"mu": (0.1, 0.25)}, multistart=1)
     assert answer.warning.startswith("the search from 1 start ended in 1 minimum: ")
