@@ -41,6 +41,11 @@ double Stepper::turn_error(double dt, const BoundaryConditions& drive, double la
   return turns_.error(solved(problem), lasts);
 }
 
+double Stepper::landing_way(double dt, const BoundaryConditions& drive) {
+  const StepProblem problem{dt, drive.damping, start_, inertia_, bodies_before_, drive.bodies};
+  return landings_.largest_way(solved(problem));
+}
+
 // How far bodies and surfaces push out what begins a step inside them, or nearer than it may be, m.
 Eigen::Vector3d Stepper::depenetration(int node, const std::vector<Body>& at_start) const {
   Eigen::Vector3d out = Eigen::Vector3d::Zero();

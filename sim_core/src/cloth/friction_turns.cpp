@@ -8,9 +8,6 @@ namespace sim_core {
 
 using Eigen::Vector3d;
 
-namespace {
-
-// How far what a node touches carries the place where it began the step, m.
 Vector3d carried_by(int node, const SolvedStep& step) {
   const StepProblem& problem = step.problem;
   const ContactState& contact = step.newton.contact;
@@ -30,8 +27,6 @@ Vector3d carried_by(int node, const SolvedStep& step) {
   }
   return way;
 }
-
-}  // namespace
 
 FrictionTurns::Rubbing FrictionTurns::rubbing(int node, const SolvedStep& step) const {
   const ContactState& contact = step.newton.contact;

@@ -22,6 +22,9 @@
 
 namespace sim_core {
 
+// How far what a node touches carries the place where the node began the step, m.
+Eigen::Vector3d carried_by(int node, const SolvedStep& step);
+
 class FrictionTurns {
  public:
   explicit FrictionTurns(int free_nodes)

@@ -65,6 +65,8 @@ class Velocities {
   // Velocity from which a node starts the next step, m/s, and b of a step of dt, s.
   Eigen::Vector3d before(int node) const { return at_node(before_, node); }
   double interval(int node, double dt) const { return age_[node] + 0.5 * dt; }
+  // Whether a node touched nothing in the last step.
+  bool was_free(int node) const { return courses_[node] == Course::free; }
   // Largest distance of a node that moved freely, or slid on, from where its velocity and
   // acceleration led it in the last step, m: an estimate of the error of the step.
   double error() const { return error_; }
