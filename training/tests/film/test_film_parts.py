@@ -4,9 +4,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from stickslip_training.film.boards import BOARDS, GAP, MARKER, TABLE, TRAY, Finder, Sight
+from stickslip_training.film.boards import (
+    BOARDS,
+    CELLS,
+    GAP,
+    MARKER,
+    TABLE,
+    TRAY,
+    Sight,
+    marker_cells,
+)
 from stickslip_training.film.drag import START_LINE, scene_camera
-from stickslip_training.film.onset import onset_of
+from stickslip_training.film.finder import Finder
+from stickslip_training.film.onset import onset_of, square_max
 from stickslip_training.film.poses import Lens, Pose, calibrated, pose_of
 from stickslip_training.film.sheet import BAR, PAGE, sheet, write_sheet
 from stickslip_training.film.sliding import PIXEL, REACH, Ground, slide_of
@@ -47,6 +57,38 @@ def test_the_markers_of_the_printed_sheet_are_found_where_they_belong():
         x = places[:, 0] - PAGE[0] / 2
         y = (1 - middle) * PAGE[1] - places[:, 1]
         assert np.column_stack([x, y]) == pytest.approx(sights[board.name].points, abs=2e-4)
+
+
+def photograph(board, plane, dots=4000.0, finer=4):
+    """Return a blurred picture of a board on white paper that `plane` takes to pixels."""
+    paper = np.full((round(0.14 * dots), round(0.2 * dots)), 230, np.uint8)
+    cell = round(MARKER / CELLS * dots)
+    for number, quad in zip(board.numbers, board.corners, strict=True):
+        left, down = np.round((quad[0] * (1, -1) + (0.1, 0.07)) * dots).astype(int)
+        cells = np.kron(marker_cells(number), np.ones((cell, cell), np.uint8))
+        paper[down : down + len(cells), left : left + len(cells)] = 20 + 210 * cells
+    to_board = np.array([[1, 0, 0.5 - 0.1 * dots], [0, -1, 0.07 * dots - 0.5], [0, 0, dots]])
+    enlarged = np.array([[finer, 0, finer / 2 - 0.5], [0, finer, finer / 2 - 0.5], [0, 0, 1]])
+    large = cv2.warpPerspective(
+        paper, enlarged @ plane @ to_board, (640 * finer, 360 * finer), borderValue=120
+    )
+    small = cv2.resize(large, (640, 360), interpolation=cv2.INTER_AREA)
+    return cv2.GaussianBlur(small, (0, 0), 0.8)
+
+
+@pytest.mark.parametrize("tilt", [10.0, 50.0])
+def test_blur_does_not_shift_the_places_of_a_board(tilt):
+    lens = Lens(640, 360, 520.0, 0.0)
+    rotation = turned(-tilt, 20.0)
+    pose = np.column_stack([rotation[:, :2], [0.02, -0.03, 0.6]])
+    plane = lens.matrix @ pose
+    sight = Finder().find(photograph(TRAY, plane))[TRAY.name]
+    true = cv2.perspectiveTransform(sight.points[None], plane)[0]
+    assert len(sight.points) == 24
+    assert np.hypot(*(sight.pixels - true).T).max() < 0.1
+    # By the corners that the search for markers gives, it is turned by 0.1 degrees or more.
+    normal = pose_of(sight, lens).rotation[:, 2]
+    assert np.degrees(np.arccos(normal @ rotation[:, 2])) < 0.05
 
 
 def test_the_sheet_is_a4_and_its_bar_has_the_stated_length(tmp_path):
@@ -129,6 +171,11 @@ def test_the_slide_tells_its_beginning(square, cube):
     assert np.mean(np.abs(errors) < 2.5) > 0.8
 
 
+def test_a_cloth_cannot_leap():
+    # From mu 1 to a kinetic friction of 0.5 at 45 degrees: g (sin - 0.5 cos) = 2 a.
+    assert 2 * square_max(np.pi / 4) == pytest.approx(9.81 * 0.5 * np.sqrt(0.5))
+
+
 def seen_from_above(ground, cloth, shift, generator, edge=0):
     """Return a view of a tray with a printed cloth that has slid [px], and a creeping edge."""
     height, width = ground.shape
@@ -142,10 +189,16 @@ def seen_from_above(ground, cloth, shift, generator, edge=0):
     return np.clip(view + generator.normal(0, 2, view.shape), 0, 255).astype(np.uint8)
 
 
-def slid(edges, shifts):
+def printed_cloth(size=40.0):
+    """Return a cloth with a pattern of some contrast, (140, 140)."""
+    noise = np.random.default_rng(1).normal(0, 4, (140, 140))
+    return 120 + size * cv2.GaussianBlur(noise, (0, 0), 3)
+
+
+def slid(edges, shifts, cloth=None):
     generator = np.random.default_rng(0)
     ground = Ground(np.array([0.0, -1.0]))
-    cloth = 120 + 40 * cv2.GaussianBlur(generator.normal(0, 4, (140, 140)), (0, 0), 3)
+    cloth = printed_cloth() if cloth is None else cloth
     views = [
         seen_from_above(ground, cloth, shift, generator, edge)
         for shift, edge in zip(shifts, edges, strict=True)
@@ -166,6 +219,23 @@ def test_a_cloth_that_slides_is_followed_and_creeping_edges_are_no_slide():
     assert slide.together > 0.8
     assert slid(np.minimum(np.arange(40) // 2, 15), np.zeros(40, int)).slide is None
     assert shifts.max() < REACH
+
+
+def striped_cloth():
+    """Return a cloth with stripes across the slope, 18 px apart, (140, 140)."""
+    stripes = 40 * (np.arange(140) % 18 < 9)[:, None]
+    return 100 + stripes + np.random.default_rng(1).normal(0, 3, (140, 140))
+
+
+@pytest.mark.parametrize("cloth", [striped_cloth(), printed_cloth(6.0)])
+def test_a_cloth_with_stripes_and_a_faint_one_are_followed(cloth):
+    shifts = np.array([0] * 30 + [1, 2, 4, 6, 8, 10, 12, 15, 18, 21])
+    slide = slid(np.zeros(40, int), shifts, cloth).slide
+    assert slide is not None
+    assert slide.patches > 20
+    assert slide.together > 0.8
+    frames = np.round(slide.times * 30).astype(int)
+    assert slide.offsets == pytest.approx(PIXEL * shifts[frames], abs=1e-3)
 
 
 def test_a_cloth_stays_only_if_it_is_seen_at_its_place():

@@ -1,4 +1,4 @@
-"""The two boards of markers that a film is measured by: their geometry, and where a frame has them.
+"""The two boards of markers that a film is measured by.
 
 A board is 2 rows of 3 square ArUco markers. One lies on the level table, one on the tray. Axes of a
 board begin in its middle: x to the right of the print, y to its upper edge, z out of the paper.
@@ -23,12 +23,6 @@ COLUMNS = 3
 ROWS = 2
 CELLS = 6
 """Cells along a side of a marker, its black frame included."""
-MARKERS_MIN = 3
-"""Fewest markers of a board in a frame that is measured: two may lie in one line."""
-CORNER_WINDOW = 5
-CORNER_SHARE = 0.6
-"""Half of the window in which a corner is placed to parts of a pixel: the lesser of these [px], and
-of this share of a cell. Smaller ones see noise of lossy films, and larger ones other corners."""
 
 
 @dataclass(frozen=True)
@@ -64,10 +58,10 @@ SIZE = (COLUMNS * (MARKER + GAP) - GAP, ROWS * (MARKER + GAP) - GAP)
 
 @dataclass(frozen=True)
 class Sight:
-    """The corners of a board in a frame."""
+    """Where a frame has points of a board."""
 
     points: Floats
-    """On the board, (N, 2) [m]."""
+    """On the board, (N, 2) [m]: the middles of the quarters of its visible markers."""
     pixels: Floats
     """In the frame, (N, 2) [px]: the middle of the first pixel is (0, 0)."""
 
@@ -85,38 +79,3 @@ def marker_cells(number: int) -> Array:
 
     picture: Any = cv2.aruco.generateImageMarker(dictionary(), number, CELLS)
     return np.asarray(picture > 0)
-
-
-class Finder:
-    """Finds boards in frames."""
-
-    def __init__(self) -> None:
-        import cv2
-
-        parameters = cv2.aruco.DetectorParameters()
-        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-        parameters.cornerRefinementWinSize = CORNER_WINDOW
-        # OpenCV spells its name like this.
-        parameters.relativeCornerRefinmentWinSize = CORNER_SHARE
-        self._detector = cv2.aruco.ArucoDetector(dictionary(), parameters)
-
-    def find(self, picture: Array) -> dict[str, Sight]:
-        """Return the boards of a picture, grey levels (H, W), by name.
-
-        A board with fewer than `MARKERS_MIN` markers is left out.
-        """
-        corners, numbers, _ = self._detector.detectMarkers(picture)
-        quads = {
-            int(number): np.asarray(quad, dtype=np.float64).reshape(4, 2)
-            for number, quad in zip(
-                np.ravel(numbers if numbers is not None else []), corners, strict=True
-            )
-        }
-        sights = {}
-        for board in BOARDS:
-            visible = [number for number in board.numbers if number in quads]
-            if len(visible) >= MARKERS_MIN:
-                places = board.corners[[number - board.first for number in visible]]
-                pixels = np.stack([quads[number] for number in visible])
-                sights[board.name] = Sight(places.reshape(-1, 2), pixels.reshape(-1, 2))
-        return sights

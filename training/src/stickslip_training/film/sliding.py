@@ -56,13 +56,25 @@ LOOKS = 15.0
 """Looks for motion in a second [1/s]: a cloth is in reach for longer."""
 BEFORE = 2.0
 """Time before the cloth has clearly moved in which its way is followed [s]."""
+AFTER = 0.2
+"""Time for which its way is followed from then on [s]: a hand has not answered yet."""
 GONE_MAX = 0.4
 """Largest correlation of a patch with what lies at its place after it has left [1]. In three films
 that judge nothing, 97 patches or more are below after a slide, and none where nothing slides."""
 CLOTH_MIN = 6
 """Fewest patches of a cloth: 6 cover 15 square centimetres or more."""
+ROWS_MIN = 3
+"""Fewest rows of patches of a cloth: an edge that creeps down the slope has one or two."""
 TOGETHER = 3
 """Largest difference between shifts of patches that move together [px]."""
+ALIKE = 0.1
+"""Largest difference of correlations at two shifts that fit a patch alike [1]: a lossy film changes
+the correlations of equal periods of a pattern by less."""
+VOTES_SHARE = 0.8
+"""Least votes for the shift of a cloth over those for any other shift."""
+STILL_LOOKS = 0.5
+"""Least mean correlation of a patch that lies on the tray while it rises from half of `STILL_TILT`
+to it [1]: a plain cloth in a lossy film has 0.6, and the table beside the tray 0.4 or less."""
 
 
 @dataclass(frozen=True)
@@ -199,12 +211,9 @@ def _shift(curve: SingleFloats, near: float, step: int) -> float:
 
 
 def _moved(matches: SingleFloats) -> Array:
-    """Return the shift of each patch that has clearly moved, and 0 of others, (P,) [px]."""
-    best = matches.argmax(axis=1)
-    top = matches.max(axis=1)
-    still = _at_place(matches)
-    clear = (top > MATCH_MIN) & (top > still + GAIN_MIN)
-    return np.where(clear & (best - BACK >= MOVED), best - BACK, 0)
+    """Return which patches have clearly moved, (P,)."""
+    top = matches[:, BACK + MOVED :].max(axis=1)
+    return np.asarray((top > MATCH_MIN) & (top > _at_place(matches) + GAIN_MIN))
 
 
 def _still(matches: SingleFloats) -> Array:
@@ -218,13 +227,19 @@ def _at_place(matches: SingleFloats) -> SingleFloats:
     return np.asarray(matches[:, BACK - STAYS : BACK + STAYS + 1].max(axis=1, initial=-1.0))
 
 
-def _cloth(matches: SingleFloats) -> Array:
-    """Return which patches have moved together in a frame, (P,)."""
-    shifts = _moved(matches)
-    moving = shifts[shifts > 0]
-    if len(moving) < CLOTH_MIN:
-        return np.zeros(len(shifts), dtype=bool)
-    return np.asarray((shifts > 0) & (np.abs(shifts - np.median(moving)) <= TOGETHER))
+def _cloth(matches: SingleFloats, moved: Array) -> Array:
+    """Return which of the patches that have moved have done so together in a frame, (P,).
+
+    A pattern with a period fits at several shifts, so each patch votes for all that fit it. What
+    begins to slide is seen at the shortest of them.
+    """
+    fits = matches[:, BACK + MOVED :] >= matches.max(axis=1, keepdims=True) - ALIKE
+    votes = (fits & moved[:, None]).sum(axis=0)
+    if votes.max(initial=0) < CLOTH_MIN:
+        return np.zeros(len(moved), dtype=bool)
+    shift = int(np.argmax(votes >= VOTES_SHARE * votes.max()))
+    near = fits[:, max(0, shift - TOGETHER) : shift + TOGETHER + 1].any(axis=1)
+    return np.asarray(moved & near)
 
 
 def slide_of(
@@ -243,51 +258,97 @@ def slide_of(
         ground: The view.
         level: The view of the level tray, without noise; NaN beyond the frame.
     """
-    patches = patches_of(ground, level)
     every = max(1, round(1.0 / (LOOKS * float(np.median(np.diff(times))))))
-    before = np.zeros(len(patches), dtype=bool)
-    # A pattern with a period lies on itself from time to time: the tray stays at every look.
-    stayed = np.ones(len(patches), dtype=bool)
-    # A patch has left that is gone in two looks: one look may be blurred.
-    left = np.zeros(len(patches), dtype=bool)
-    gone_before = np.zeros(len(patches), dtype=bool)
+    rising = (tilts > STILL_TILT / 2) & (tilts < STILL_TILT)
+    early = [views[frame] for frame in range(0, len(times), every) if rising[frame]]
+    patches = _lying(level, early, patches_of(ground, level))
+    looks = Looks(len(patches))
     for frame in range(0, len(times), every):
-        matches = correlations(level, views[frame], patches).max(axis=2)
-        if tilts[frame] < STILL_TILT:
-            stays = _at_place(matches) > STILL_MIN
-            patches, matches = patches[stays], matches[stays]
-            before, stayed, gone_before = before[stays], stayed[stays], gone_before[stays]
-        stayed &= _still(matches)
-        gone = _at_place(matches) < GONE_MAX
-        left = gone & gone_before
-        gone_before = gone
-        moving = _cloth(matches)
-        # Only what has moved in two looks is no chance match.
-        cloth = moving & before
-        if cloth.sum() >= CLOTH_MIN:
+        looks.add(correlations(level, views[frame], patches).max(axis=2))
+        if _is_cloth(patches[looks.cloth]):
             first = int(np.searchsorted(times, times[frame] - BEFORE))
-            share = float(moving.sum() / (_moved(matches) > 0).sum())
-            used = slice(first, frame + 1)
-            offsets = _path(views[used], level, patches[cloth])
-            if stayed.sum() >= CLOTH_MIN:
+            used = slice(first, int(np.searchsorted(times, times[frame] + AFTER)))
+            offsets = _path(views[used], level, patches[looks.moving])
+            tray = patches[looks.stayed]
+            if len(tray) >= CLOTH_MIN:
                 # What poses are off by moves the tray's own texture alike.
-                tray = patches[stayed][:: 1 + int(stayed.sum()) // TRAY_MAX]
-                offsets = offsets - _path(views[used], level, tray, BACK // 2)
-            slide = Slide(times[used], offsets, int(cloth.sum()), share)
-            return Motion(slide, len(patches), int(left.sum()))
-        before = moving
-    return Motion(None, len(patches), int(left.sum()))
+                some = tray[:: 1 + len(tray) // TRAY_MAX]
+                offsets = offsets - _path(views[used], level, some, BACK // 2)[: len(offsets)]
+            slide = Slide(
+                times[used][: len(offsets)], offsets, int(looks.moving.sum()), looks.together
+            )
+            return Motion(slide, len(patches), int(looks.left.sum()))
+    return Motion(None, len(patches), int(looks.left.sum()))
+
+
+def _is_cloth(patches: Array) -> bool:
+    """Return whether patches (P, 2) that move together are a cloth, and no edge that creeps."""
+    return len(patches) >= CLOTH_MIN and len(np.unique(patches[:, 0])) >= ROWS_MIN
+
+
+def _lying(level: SingleFloats, views: Sequence[Array], patches: Array) -> Array:
+    """Return the patches that lie on the tray, by views of the tray that begins to rise."""
+    if not len(patches) or not views:
+        return patches
+    places = [_at_place(correlations(level, view, patches).max(axis=2)) for view in views]
+    return np.asarray(patches[np.mean(places, axis=0) > STILL_LOOKS])
+
+
+class Looks:
+    """What looks at patches have shown so far."""
+
+    def __init__(self, count: int) -> None:
+        """Begin with so many patches."""
+        nowhere = np.zeros(count, dtype=bool)
+        # Only what has moved in two looks is no chance match.
+        self._moved, self._moved_before = nowhere, nowhere
+        self._moving_before = nowhere
+        self.moving: Array = nowhere
+        """Which patches have moved together in the last look, (P,)."""
+        # A patch has left that is gone in two looks: one look may be blurred.
+        self._gone, self._gone_before = nowhere, nowhere
+        self.stayed: Array = ~nowhere
+        """Which patches have stayed in all looks, (P,): the tray. A pattern with a period lies on
+        itself from time to time."""
+
+    def add(self, matches: SingleFloats) -> None:
+        """Take another look, by correlations (P, S)."""
+        self._moved_before, self._moved = self._moved, _moved(matches)
+        self._moving_before, self.moving = self.moving, _cloth(matches, self._moved)
+        self._gone_before, self._gone = self._gone, _at_place(matches) < GONE_MAX
+        self.stayed = self.stayed & _still(matches)
+
+    @property
+    def cloth(self) -> Array:
+        """Return which patches have moved together in two looks, (P,)."""
+        return self.moving & self._moving_before
+
+    @property
+    def together(self) -> float:
+        """Return the share of patches that moved in two looks and together in the last one."""
+        moved = self._moved & self._moved_before
+        return float((moved & self.moving).sum() / max(1, moved.sum()))
+
+    @property
+    def left(self) -> Array:
+        """Return which patches have left their place, (P,)."""
+        return self._gone & self._gone_before
 
 
 def _path(
     views: Sequence[Array], level: SingleFloats, patches: Array, step: int = STEP_MAX
 ) -> Floats:
-    """Return the common shift of patches in each view, (N,) [m]: up to `step` px from the last."""
-    offsets = []
+    """Return the common shift of patches in each view, (N,) [m]: up to `step` px from the last.
+
+    It ends as the patches come to the end of the reach.
+    """
+    offsets: list[float] = []
     near = 0.0
     for view in views:
         # All shift aside alike: a striped patch alone may slip along its stripes.
         together = correlations(level, view, patches).mean(axis=0).max(axis=1)
         near = _shift(together, near, step)
+        if near > REACH - 1:
+            break
         offsets.append(near)
     return PIXEL * np.array(offsets)
