@@ -272,8 +272,8 @@ def slide_of(
             tray = patches[looks.stayed]
             if len(tray) >= CLOTH_MIN:
                 # What poses are off by moves the tray's own texture alike.
-                some = tray[:: 1 + len(tray) // TRAY_MAX]
-                offsets = offsets - _path(views[used], level, some, BACK // 2)[: len(offsets)]
+                tray = tray[:: 1 + len(tray) // TRAY_MAX]
+                offsets = offsets - _path(views[used], level, tray, BACK // 2)[: len(offsets)]
             slide = Slide(
                 times[used][: len(offsets)], offsets, int(looks.moving.sum()), looks.together
             )
