@@ -80,7 +80,10 @@ def test_drag_is_differentiated(name: str) -> None:
 
     family = replace(free, make=with_steps)
     by = family.differentiated([name]).run().sensitivities[name].positions[1:]
-    value, h = family.parameters[name].value, 1e-5
+    value = family.parameters[name].value
+    # Parts of the bending move the cloth less, and digits of positions would show in a difference
+    # by a smaller change.
+    h = 1e-4 if name in PARTS_OF_BENDING else 1e-5
     high, low = (family.scene(**{name: value + step}).run().positions[1:] for step in (h, -h))
     errors = np.linalg.norm((high - low) / (2.0 * h) - by, axis=(1, 2))
     sizes = np.linalg.norm(by, axis=(1, 2))
