@@ -14,6 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 from stickslip_sim_core import PRESETS, Cloth, build_info, fabric, fabric_names, plane
+from stickslip_sim_core.arrays import Floats
 from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.scenes import cloth_drag
 from stickslip_sim_core.scenes.holders import Hands, Holder
@@ -41,8 +42,12 @@ def run(material: str, mu: float, preset: str, vertices: int, seconds: float) ->
     cloth.set_state(hung.positions)
     hands = Hands([Holder(hung.held, cloth_drag.holder_pose)], hung.positions)
     motion = hands.driving(cloth_drag.motion_of(hung, plane(mu)))
-    floor = np.tile(plane(mu).pose, (64, 1, 1, 1))
-    cloth.advance(seconds, motion, path=lambda times: (hands.at(times), floor[: len(times)]))
+    floor = plane(mu).pose
+
+    def path(times: Floats) -> tuple[Floats, Floats]:
+        return hands.at(times), np.tile(floor, (len(times), 1, 1, 1))
+
+    cloth.advance(seconds, motion, path=path)
     cpu = time.process_time() - start
     total, steps = cloth.total, cloth.total.steps
     print(
