@@ -148,7 +148,10 @@ void Sensitivities::differentiate_by(const SensitivityTerm& term, const Step& st
       }
       return;
     }
-    default:  // contacts bring friction in
+    case Kind::friction_of_body:
+    case Kind::friction_of_pair:
+    case Kind::static_friction_of_body:
+    case Kind::static_friction_of_pair:  // contacts bring these in
       return;
   }
 }
