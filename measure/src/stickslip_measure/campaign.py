@@ -215,7 +215,7 @@ def _experiment(row: _Row, experiment: Experiment) -> Iterator[tuple[Cell, bool]
             cell = _cell(row, experiment, cells, path.with_suffix(".log"), key, obstacle)
             _write(path, cell)
         obstacle = OBSTACLES.get(cell.state, obstacle)
-        if cell.state == HangError.state:
+        if cell.state == HangError.state and not is_recorded:
             row.patience = IMPATIENCE
         yield cell, is_recorded
 

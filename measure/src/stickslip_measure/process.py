@@ -244,8 +244,8 @@ class AdapterProcess:
 
     @property
     def waited_text(self) -> str:
-        """The time that was waited, as a message has it."""
-        return f"{round(self.waited, 1):g}"
+        """The time that was waited, as a message has it: a busy machine notices its limit late."""
+        return f"{min(round(self.waited, 1), self._longest_wait):g}"
 
     @property
     def is_stuck(self) -> bool:

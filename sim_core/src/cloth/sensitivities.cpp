@@ -4,8 +4,6 @@
 #include <cmath>
 #include <limits>
 
-#include "math/refusal.hpp"
-
 namespace sim_core {
 namespace {
 
@@ -31,21 +29,6 @@ double largest_of(const Buffer<double>& vectors) {
 }
 
 }  // namespace
-
-void refuse_unknown(const SensitivityTerm& term, const Eigen::MatrixXd& mu, int sheets) {
-  using Kind = SensitivityTerm::Kind;
-  if (term.is_friction_of_pair()) {
-    const bool known = term.first >= 0 && term.second < mu.rows();
-    if (!known || !(mu(term.first, term.second) >= 0.0)) {
-      refuse(text("parameter: friction must be of two sheets, or of a sheet and a surface, that ",
-                  "touch each other, got ", term.first, " and ", term.second));
-    }
-    return;
-  }
-  const int sheet = term.is_friction_of_body() ? term.second : term.first;
-  if (sheet >= sheets)
-    refuse(text("parameter: must be of one of ", sheets, " sheets, got sheet ", sheet));
-}
 
 Sensitivities::Sensitivities(Assembly& assembly, Newton& newton, const ClothSettings& settings)
     : assembly_(assembly), newton_(newton), settings_(settings) {}

@@ -273,7 +273,10 @@ def slide_of(
             if len(tray) >= CLOTH_MIN:
                 # What poses are off by moves the tray's own texture alike.
                 tray = tray[:: 1 + len(tray) // TRAY_MAX]
-                offsets = offsets - _path(views[used], level, tray, BACK // 2)[: len(offsets)]
+                of_tray = _path(views[used], level, tray, BACK // 2)
+                # Either may come to the end of its reach first.
+                both = min(len(offsets), len(of_tray))
+                offsets = offsets[:both] - of_tray[:both]
             slide = Slide(
                 times[used][: len(offsets)], offsets, int(looks.moving.sum()), looks.together
             )
