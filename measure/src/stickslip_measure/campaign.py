@@ -179,7 +179,7 @@ def measure(request: Request, tell: Tell) -> Description:
 def _cells_of(row: _Row) -> Iterator[tuple[Cell, bool]]:
     # A fault that the checks find explains values of the experiments.
     for name in (*experiments.CHECKS, *row.request.names):
-        yield from _experiment(row, _named(name))
+        yield from _experiment(row, experiments.experiment_named(name))
     # A simulator with another bending model may still bend right, up to a factor.
     stiffness = _stiffness(row)
     if stiffness is None or abs(stiffness - 1.0) < FACTOR:
@@ -187,11 +187,7 @@ def _cells_of(row: _Row) -> Iterator[tuple[Cell, bool]]:
     calibrated = replace(row, name=f"{row.setting}, {CALIBRATED}", softer=1.0 / stiffness)
     for name in experiments.BENDING:
         if name in row.request.names:
-            yield from _experiment(calibrated, _named(name))
-
-
-def _named(name: str) -> Experiment:
-    return {**experiments.CHECKS, **experiments.EXPERIMENTS}[name]
+            yield from _experiment(calibrated, experiments.experiment_named(name))
 
 
 def _stiffness(row: _Row) -> float | None:

@@ -20,9 +20,6 @@ ADAPTERS = Path(__file__).parent / "adapters"
 PROGRAM_VARIABLE = "STICKSLIP_MEASURE_PROGRAM"
 """Variable of the environment with the name by which the user has called the command."""
 
-RODS = "hanging-rod"
-"""The experiment whose resolution is a number of elements of a rod."""
-
 RECORDED = "  [from an earlier run]"
 """End of the line of a result that was not measured now."""
 
@@ -125,12 +122,12 @@ def parser() -> argparse.ArgumentParser:
 
 def line_of(cell: Cell, *, is_recorded: bool = False) -> str:
     """Return the line that is printed for a cell."""
-    unit = "elements" if cell.experiment == RODS else "cells"
+    experiment = experiments.experiment_named(cell.experiment)
+    unit = "elements" if "rods" in experiment.needs else "cells"
     place = f"{cell.row:10} {cell.experiment:18} {cell.cells:3} {unit:8}"
     ending = RECORDED if is_recorded else ""
     if cell.state != MEASURED:
         return f"{place}  {cell.state}: {cell.reason}{ending}"
-    experiment = {**experiments.CHECKS, **experiments.EXPERIMENTS}[cell.experiment]
     value = f"{cell.value:.6g} {experiment.unit}".strip()
     return f"{place}  {value} (expected {cell.expected:.6g})  {cell.cpu:.1f} CPU s{ending}"
 

@@ -33,3 +33,8 @@ MOTION = ("incline-onset", "kinetic-friction", "stacked-incline", "capstan", "pu
 
 BENDING = ("cantilever", "lateral-buckling", "drape")
 """Experiments whose value is proportional to bending stiffness."""
+
+
+def experiment_named(name: str) -> Experiment:
+    """Return an experiment or a check by its name."""
+    return CHECKS[name] if name in CHECKS else EXPERIMENTS[name]
