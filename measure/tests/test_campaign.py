@@ -3,6 +3,7 @@
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -77,6 +78,29 @@ def test_a_lie_about_time_spoils_what_moves(falling: Adapter, tmp_path: Path) ->
     assert 'data-column="verdict">not requested</td>' in page
 
 
+def cells_with(experiment: str, value: float, counts: tuple[int, ...] = (5, 10, 20)) -> list[Cell]:
+    """Return cells of an experiment that all have one value, of an expected 1."""
+    return [
+        Cell("s", "1", "default", experiment, count, "measured", "", value, 1.0, 0.0, "")
+        for count in counts
+    ]
+
+
+@pytest.mark.parametrize(
+    ("still", "faults"),
+    [(0.8, ["steps cover", "friction is 0.800"]), (1.0, ["steps cover"])],
+)
+def test_a_lie_about_time_hides_no_factor_on_friction(still: float, faults: list[str]) -> None:
+    (fall,) = cells_with("fall", 0.64, (4,))
+    fall = replace(fall, details={"size at the start over the scene's": 1.0})
+    # The wrong time spoils what moves; two experiments show how much friction holds.
+    moving = [*cells_with("kinetic-friction", 0.5), *cells_with("pull-out", 0.5)]
+    holding = [*cells_with("house-of-cards", still), *cells_with("pinch", still)]
+    named = [finding.fault for finding in findings([fall, *moving, *holding])]
+    assert len(named) == len(faults)
+    assert all(map(str.startswith, named, faults))
+
+
 def test_drag_is_no_lie_about_time(falling: Adapter, tmp_path: Path) -> None:
     cells = measured(falling(step="self.v *= 0.97"), tmp_path)
     assert findings(cells)[0].fault == "something brakes a free fall"
@@ -125,6 +149,29 @@ def test_a_change_of_an_imported_module_is_measured(
     assert flags == [False, False, True, True, False, False]
     sources = read_cell(out / "falling" / "default" / "fall-4.json").sources
     assert set(sources) == {str(program.adapter), str(module)}
+
+
+@pytest.mark.parametrize(
+    ("fault", "state"),
+    [
+        ("import os; os._exit(3)", "crashed"),
+        ("import time; time.sleep(600)", "hangs"),
+        ("raise ValueError('gone')", "failed"),
+    ],
+)
+def test_a_module_that_ends_a_step_is_measured_again_once_it_is_mended(
+    falling: Adapter, tmp_path: Path, fault: str, state: str
+) -> None:
+    module = tmp_path / "physics.py"
+    module.write_text(f"{fault}\n")
+    program = falling(step="import physics")
+    path = tmp_path / "falling" / "default" / "fall-4.json"
+    measured(program, tmp_path, seconds=4.0)
+    assert read_cell(path).state == state
+    assert str(module) in read_cell(path).sources
+    module.write_text("PULL = 1.0\n")
+    measured(program, tmp_path)
+    assert read_cell(path).value == pytest.approx(1.0)
 
 
 def test_a_cell_of_an_older_version_is_measured_again(falling: Adapter, tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """An adapter runs in a process of its own. What goes wrong in it has a name and a reason."""
 
 import ast
+import re
 import sys
 import time
 from collections.abc import Callable
@@ -61,6 +62,16 @@ def fall(program: Program, log: Path, seconds: float = 30.0, duration: float = 0
         simulation = Simulation(process, patch(), "default")
         simulation.rest(duration, DOWN)
         return simulation.positions
+
+
+def test_an_adapter_is_not_the_simulator_of_its_name(
+    written: Callable[[str], Program], tmp_path: Path
+) -> None:
+    # `import mujoco` in mujoco.py, where MuJoCo is not installed.
+    with pytest.raises(
+        SetupError, match=re.escape("No module named 'adapter' (adapter.py, line 1)")
+    ):
+        describe(written("import adapter"), tmp_path / "log", 60.0)
 
 
 def test_a_step_advances_and_returns_positions(falling: Adapter, tmp_path: Path) -> None:

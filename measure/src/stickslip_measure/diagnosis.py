@@ -130,11 +130,12 @@ def clamp(row: Rows) -> Finding | None:
 
 
 def friction(row: Rows) -> Finding | None:
-    """Find a factor on friction, but for one that a wrong time explains."""
+    """Find a factor on friction, by experiments that a wrong time does not spoil."""
+    names: Sequence[str] = experiments.FRICTION
     timing = clock(row)
     if timing is not None and timing.spoiled:
-        return None
-    return _factor(row, experiments.FRICTION, "friction")
+        names = [name for name in names if name not in experiments.MOTION]
+    return _factor(row, names, "friction")
 
 
 def bending(row: Rows) -> Finding | None:

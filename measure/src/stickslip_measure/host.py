@@ -7,6 +7,7 @@ library and NumPy only, and nothing of this package but two files beside it.
 from __future__ import annotations  # Python 3.9 reads the types below as text
 
 import hashlib
+import importlib.abc
 import importlib.util
 import logging
 import os
@@ -14,8 +15,10 @@ import platform
 import site
 import sys
 import sysconfig
+import threading
 import time
 import traceback
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -94,13 +97,18 @@ class Sources:
         for module in list(sys.modules.values()):
             # `getattr` would load modules that wait to be used.
             name = getattr(module, "__dict__", {}).get("__file__")
-            if not isinstance(name, str) or name in self.names:
-                continue
-            self.names.add(name)
-            path = Path(name).resolve()
-            if self.belongs(path):
-                digests[str(path)] = hashlib.sha256(path.read_bytes()).hexdigest()
+            digests.update(self.addition(name))
         return digests
+
+    def addition(self, name: Any) -> dict[str, str]:
+        """Return the digest of the file of a module, by path, unless it is known or installed."""
+        if not isinstance(name, str) or name in self.names:
+            return {}
+        self.names.add(name)
+        path = Path(name).resolve()
+        if not self.belongs(path):
+            return {}
+        return {str(path): hashlib.sha256(path.read_bytes()).hexdigest()}
 
     def belongs(self, path: Path) -> bool:
         """Return whether the file of a module decides results beside the simulator's version."""
@@ -120,6 +128,47 @@ def installed_places() -> list[Path]:
     return [Path(place).resolve() for place in places]
 
 
+class ImportWatch(importlib.abc.MetaPathFinder):
+    """Tells of each module before it is run, so that one that crashes or hangs is known as well.
+
+    It finds nothing itself: it asks the finders behind it in `sys.meta_path`.
+
+    Args:
+        adapter: The file of the adapter.
+        sources: The files that are known.
+        tell: Takes the digests of a file that was not, by path.
+    """
+
+    def __init__(
+        self, adapter: Path, sources: Sources, tell: Callable[[dict[str, str]], None]
+    ) -> None:
+        self.adapter = adapter
+        self.sources = sources
+        self.tell = tell
+
+    def find_spec(self, name: str, path: Any, target: Any = None) -> Any:
+        """Return the specification of a module, or None if no other finder has it.
+
+        Raises:
+            ModuleNotFoundError: Only the adapter itself has this name.
+        """
+        behind = sys.meta_path[sys.meta_path.index(self) + 1 :]
+        for finder in behind:
+            # Finders of old packages lack the method, and Python skips them too.
+            find = getattr(finder, "find_spec", None)
+            spec = None if find is None else find(name, path, target)
+            if spec is None:
+                continue
+            # An adapter often has the name of its simulator, which may not be installed.
+            if spec.has_location and Path(spec.origin).resolve() == self.adapter:
+                raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+            digests = self.sources.addition(spec.origin if spec.has_location else None)
+            if digests:
+                self.tell(digests)
+            return spec
+        return None
+
+
 class Host:
     """Answers requests about one adapter. It runs at most one scene."""
 
@@ -128,7 +177,10 @@ class Host:
         self.wire = load(FOLDER / "wire.py", "stickslip_wire")
         self.adapter = adapter
         self.replies = replies
+        # A simulator may import a module in a thread of its own.
+        self.sending = threading.Lock()
         self.sources = Sources(adapter)
+        sys.meta_path.insert(0, ImportWatch(adapter, self.sources, self.send_sources))
         self.simulator: Any = None
         self.run: Any = None
 
@@ -148,14 +200,22 @@ class Host:
 
     def send(self, header: dict[str, Any], arrays: list[Any]) -> None:
         """Send a message to the measurement."""
-        self.replies.write(self.wire.encoded(header, arrays))
-        self.replies.flush()
+        message = self.wire.encoded(header, arrays)
+        with self.sending:
+            self.replies.write(message)
+            self.replies.flush()
+
+    def send_sources(self, digests: dict[str, str]) -> None:
+        """Send the digests of files that are about to be imported, by path."""
+        self.send({"imports": digests}, [])
 
     def describe(self, header: dict[str, Any], arrays: list[Any]) -> tuple[Any, list[Any]]:
         """Import the adapter, and return its description of itself."""
         # An adapter may import files beside it. They come last: an adapter often has the name of
         # the simulator that it imports.
         sys.path.append(str(self.adapter.parent))
+        # No finder looks for the adapter itself.
+        self.send_sources(self.sources.addition(str(self.adapter)))
         self.simulator = simulator_of(load(self.adapter, "stickslip_adapter"))
         settings = {name: dict(facts) for name, facts in self.simulator.settings.items()}
         return {

@@ -228,8 +228,7 @@ class AdapterProcess:
             # The reason follows from how the process has ended.
             raise self._crash() from None
         reply, results = wire.read_message(self._read)
-        while "ended" in reply:
-            self._count_step()
+        while not self._is_last(reply):
             reply, results = wire.read_message(self._read)
         self.cpu = float(reply.pop("cpu"))
         self.sources.update(reply.pop("sources"))
@@ -252,6 +251,16 @@ class AdapterProcess:
         """Whether the answer that is late does not come at all, as far as one can tell."""
         limit = max(STUCK * self.longest, STUCK_LEAST) if self.steps else math.inf
         return self.waited >= min(self.patience, limit)
+
+    def _is_last(self, message: Mapping[str, Any]) -> bool:
+        """Return whether a message is the answer to the request, and note it if it is not."""
+        if "ended" in message:
+            self._count_step()
+            return False
+        if "imports" in message:
+            self.sources.update(message["imports"])
+            return False
+        return True
 
     def _count_step(self) -> None:
         self.longest = max(self.longest, self.waited)
