@@ -129,7 +129,7 @@ def installed_places() -> list[Path]:
 
 
 class ImportWatch(importlib.abc.MetaPathFinder):
-    """Tells of each module before it is run, so that one that crashes or hangs is known as well.
+    """Names each module before it is run, so that a module that crashes or hangs is known as well.
 
     It finds nothing itself: it asks the finders behind it in `sys.meta_path`.
 
