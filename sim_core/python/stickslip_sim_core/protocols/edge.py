@@ -40,6 +40,12 @@ FABRIC = custom_fabric(
 )
 LINE_WEIGHT = DENSITY * GRAVITY * WIDTH  # N/m
 SPEED = 0.02  # of the end that is pulled [m/s]
+# The strip starts this far above the table [m]. Its held end comes down to it in a time [s]: one
+# that stays above lifts a centimetre of the strip, which then does not rub.
+ABOVE = 2e-4
+LOWERED = 0.5
+DRAG = FABRIC.damping * SPEED / GRAVITY
+"""Of damping, over the weight."""
 # The end is pulled from the first time to the last [s].
 START = 1.0
 END = 3.0
@@ -89,15 +95,16 @@ class Edge(ClothProtocol):
 def pull_needed(hanging: float, flat: float, radius: float, mu: float) -> float:
     """Return the pull [N] on a strip without stiffness over a quarter turn of a radius [m].
 
-    dT/da = mu T + q R (sin a + mu cos a) from the hanging part, of a length `hanging` [m], to the
-    flat part, of a length `flat`, where friction of the weight is added.
+    dT/da = mu T + q R (sin a + mu cos a + d) from the hanging part, of a length `hanging` [m], to
+    the flat part, of a length `flat`, where friction of the weight is added. All of the strip
+    moves, and its damping adds d of its weight to the pull.
     """
-    tension = LINE_WEIGHT * hanging
+    tension = LINE_WEIGHT * hanging * (1.0 + DRAG)
     for angle in (np.arange(STEPS) + 0.5) / STEPS * np.pi / 2:
         # From the side of the table, where the face is upright, to the top.
-        weight = LINE_WEIGHT * radius * (np.cos(angle) + mu * np.sin(angle))
+        weight = LINE_WEIGHT * radius * (np.cos(angle) + mu * np.sin(angle) + DRAG)
         tension += (mu * tension + weight) * np.pi / 2 / STEPS
-    return float(tension + mu * LINE_WEIGHT * flat)
+    return float(tension + LINE_WEIGHT * (mu + DRAG) * flat)
 
 
 @dataclass(frozen=True)
@@ -107,21 +114,23 @@ class Table:
     bodies: Sequence[Body]
     surfaces: Sequence[Surface]
     height: float
-    """Of the strip over the table at first [m]."""
+    """Of the strip that lies on the table [m]."""
     corner: float
     """Where its flat part ends [m]."""
+    side: float
+    """Height at which its hanging part begins [m]."""
 
 
 def box_table(mu: float, radius: float) -> Table:
     """Return a box whose edges are rounded with a radius [m]."""
     body = box(mu, (0.4, 0.1, 0.2), rounding=radius, origin=(-0.2, 0.0, -0.1))
-    return Table([body], (), 2e-4, -radius)
+    return Table([body], (), 0.0, -radius, -radius)
 
 
 def skin_table(mu: float, radius: float) -> Table:
     """Return a sharp mesh with a skin that keeps vertices at a radius [m] from it."""
     surface = Surface(TRIANGLES, CORNERS, mu, 2.0 * radius - THICKNESS)
-    return Table((), [surface], radius + 2e-4, 0.0)
+    return Table((), [surface], radius, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -137,22 +146,24 @@ def pull_over(table: Table, radius: float, mu: float, preset: SolverSettings) ->
     """Pull a strip over the edge of a table, which has a radius [m]."""
     mesh = meshes.grid(LENGTH, WIDTH, round(LENGTH / CELL), 2)
     held = np.flatnonzero(mesh.rest[:, 0] < -0.5 * LENGTH + 1e-9)
+    free = np.flatnonzero(mesh.rest[:, 0] > 0.5 * LENGTH - 1e-9)
     contact = SelfContact(0.5, THICKNESS) if table.surfaces else None
     cloth = Cloth(mesh, FABRIC, preset, held=held, self_contact=contact, surfaces=table.surfaces)
     along = mesh.rest[:, 0] + 0.5 * LENGTH - BEFORE
-    start = np.column_stack([along, mesh.rest[:, 1], np.full(len(along), table.height)])
+    start = np.column_stack([along, mesh.rest[:, 1], np.full(len(along), table.height + ABOVE)])
     cloth.set_state(start, bodies=table.bodies)
 
     def motion(time: float) -> tuple[Floats, Floats, Sequence[Body]]:
         way = SPEED * max(time - START, 0.0)
-        return cloth.gravity, start[held] - [way, 0.0, 0.0], table.bodies
+        down = ABOVE * min(time / LOWERED, 1.0)
+        return cloth.gravity, start[held] - [way, 0.0, down], table.bodies
 
     pulls = []
     needs = []
     for time in np.arange(END - 2.0 * CELL / SPEED, END, INTERVAL):
         cloth.advance(time, motion)
         flat = table.corner - float(cloth.positions[held, 0].mean())
-        hanging = LENGTH - flat - radius * np.pi / 2
+        hanging = table.side - float(cloth.positions[free, 2].mean())
         pulls.append(-float(cloth.reactions[held, 0].sum()))
         # The holder bears half of the last cell, which does not rub.
         needs.append(pull_needed(hanging, flat - 0.5 * CELL, radius, mu))
