@@ -31,14 +31,14 @@ BodyContact contact_with(const Newton& newton, const std::vector<Body>& bodies, 
 
 // Cloth turns at nodes, by an angle a where the face of a body of radius R turns by it along a cell
 // h: sin(a/2) = h/(2 R). Friction would be off by up to a^2/8 of itself. At nodes it is corrected
-// for that (contact/capstan.hpp), and strips over rods, box edges and meshes were then off by less
-// than a^4/100, down to R of 0.75 cells: R = 1, mu 0.3 and 0.6: 0.3 % (estimate 1.2 %); R = 0.75,
-// mu 0.6: 2.3 % (estimate 4.5 %). Below, the correction vouches for nothing.
+// for that (contact/capstan.hpp), and strips over rods, box edges and meshes are then off by less
+// than a^4/75, down to R of 0.9 cells: at most 1.3 % there, where a^4/75 is 2.6 %. Below 0.7 cells
+// the correction vouches for nothing.
 constexpr double corrected_to = 0.7;  // h/(2 R)
 
 double corrected_error(double lean) {
   const double turn = 2.0 * std::asin(std::min(1.0, lean));
-  return lean <= corrected_to ? std::pow(turn, 4) / 100.0 : std::min(1.0, turn * turn / 8.0);
+  return lean <= corrected_to ? std::pow(turn, 4) / 75.0 : std::min(1.0, turn * turn / 8.0);
 }
 
 double angle_between(const Vector3d& a, const Vector3d& b) {
@@ -237,18 +237,37 @@ void StepDiagnostics::measure_contacts(const StepTaken& step, const Newton& newt
 }
 
 // The normals half a cell behind and ahead of a node lean by b from each other's mean, and tan b =
-// h/(2 R).
+// h/(2 R). The correction is right where tension along friction presses, and where a difference of
+// that tension carries friction away. So it counts as an error as far as weight, inertia and other
+// cloth press, and as far as the face is round across friction, too: there tension across presses,
+// and shear may carry friction away, as in a sheet under which a ball turns. Of a rod the product
+// of the curvatures is 0, wherever friction points; of a ball it is the square of that along
+// friction.
 double StepDiagnostics::node_error(const StepTaken& step, const Newton& newton, int node,
-                                   const Vector3d& slip) const {
-  const int b = newton.contact.touched[node], bodies = static_cast<int>(step.at_end.size());
-  const Vector3d p = at_node(step.x, node);
-  const Vector3d half_cell = 0.5 * cell_[assembly_.numbering.vertex[node]] * slip.normalized();
-  const auto normal_at = [&](const Vector3d& near) {
-    return b < bodies ? gap_of(step.at_end[b], near).normal
-                      : newton.contact.surfaces->normal_near(node, near);
+                                   const BodyContact& on, const Vector3d& slip) const {
+  const Vector3d p = at_node(step.x, node), along = -slip.normalized(), n = on.gap.normal;
+  const Vector3d half_cell = 0.5 * cell_[assembly_.numbering.vertex[node]] * along;
+  const auto normal_at = [&](const Vector3d& near) -> Vector3d {
+    return on.body < static_cast<int>(step.at_end.size())
+               ? gap_of(step.at_end[on.body], near).normal
+               : newton.contact.surfaces->normal_near(node, near);
   };
-  return corrected_error(
-      std::tan(0.5 * angle_between(normal_at(p - half_cell), normal_at(p + half_cell))));
+  const Vector3d behind = normal_at(p - half_cell), ahead = normal_at(p + half_cell);
+  const double error = corrected_error(std::tan(0.5 * angle_between(behind, ahead)));
+  // Normals of meshes are too rough for their curvature across friction.
+  if (on.body >= static_cast<int>(step.at_end.size())) return error;
+  const auto mu_along = [&](const Vector3d& friction) {
+    return newton.contact.mu_at(node, on, p, friction, step.at_end).mu;
+  };
+  const double mu = mu_along(Vector3d::Zero()), corrected = mu_along(along);
+  if (!(corrected < mu)) return error;
+  const Vector3d aside = n.cross(half_cell), turn = ahead - behind;
+  const Vector3d turn_aside = normal_at(p + aside) - normal_at(p - aside);
+  const double both_ways = n.dot(turn.cross(turn_aside)) / turn.squaredNorm();
+  const double elastic = at_node(assembly_.gradient, node).dot(n);
+  const double tension = elastic / std::max(elastic, at_node(newton.residual, node).dot(n));
+  const double right = elastic > 0.0 ? tension * (1.0 - std::clamp(both_ways, 0.0, 1.0)) : 0.0;
+  return std::min(1.0, error + (1.0 - corrected / mu) * (1.0 - right));
 }
 
 // Pairs are not corrected. Their normal turns as they slide, and by a along a cell.
@@ -284,19 +303,20 @@ void StepDiagnostics::measure_friction(const StepTaken& step, const Newton& newt
     const int b = newton.contact.touched[i];
     if (newton.contact.mode[i] != contact_slip || b < 0) continue;
     const Vector3d from = at_node(step.start, i), to = at_node(step.x, i);
+    const Vector3d n = at_node(newton.contact.normal, i).cast<double>();
+    BodyContact on{{0.0, n}, b};
     Vector3d slip;
-    bool hollow = false;  // a fillet, where cloth does not turn round anything
     if (b < bodies) {
-      const BodyContact on = contact_with(newton, step.at_end, b, to, i);
+      on = contact_with(newton, step.at_end, b, to, i);
       slip = ContactState::slip(on, from, to, step.at_start, step.at_end);
-      hollow = on.neighbours[0] >= 0;
     } else {
-      const Vector3d n = at_node(newton.contact.normal, i).cast<double>();
       slip = newton.contact.surfaces->slip(i, from, to);
       slip -= slip.dot(n) * n;
     }
     const double work = std::abs(at_node(newton.residual, i).dot(slip));
-    if (work > 0.0) count(b, work, hollow ? 0.0 : node_error(step, newton, i, slip));
+    // On a fillet cloth does not turn round anything.
+    const bool hollow = on.neighbours[0] >= 0;
+    if (work > 0.0) count(b, work, hollow ? 0.0 : node_error(step, newton, i, on, slip));
   }
   if (!newton.pairs) return;
   const ContactMaterials& materials = newton.pairs->materials;

@@ -172,8 +172,9 @@ CHECKS = (
         "friction_error",
         "relative error of the coefficient of friction with one body, surface or sheet by the size "
         "of cells: mean of e over the work of friction, where this work lifts the cloth by a cell. "
-        "Cloth that turns by an angle a along a cell has e = a^4/100 at vertices, which are "
-        "corrected for cells, and a^2/8 elsewhere and over radii below 0.7 cells",
+        "Cloth that turns by an angle a along a cell has e = a^4/75 at vertices, which are "
+        "corrected for cells, and, on bodies, the correction itself as far as weight presses or "
+        "the face is round both ways; and a^2/8 elsewhere and over radii below 0.7 cells",
         lambda seen: max(_friction_errors(seen.cloth), default=0.0),
         0.03,
         "18 strips pulled over box edges and creases of meshes of 0.25 to 2 cells, mu 0.1 to 0.6: "
