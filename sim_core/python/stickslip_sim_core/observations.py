@@ -17,6 +17,15 @@ PIXEL_NOISE = 12.0**-0.5
 """Standard deviation of a place that is known to one pixel, evenly within it [px]."""
 
 
+PATCH = 32
+"""Side of the squares of a picture whose points of an outline are one group of errors [px].
+
+Errors of pixels depend on one another along an outline that nearly follows a row or a column, and
+those of a mesh over its cells. In a film of a drag four points have one independent error together,
+so a patch is larger than that and still far smaller than the cloth.
+"""
+
+
 def check_frames(frames: Sequence[int], vertices: NDArray[np.intp], run: ClothRun) -> None:
     """Check that a run has these frames and vertices.
 
@@ -259,9 +268,19 @@ class Silhouettes:
             distances.append(nearest.distances)
             for of_parameter, derivative in zip(changes, derivatives, strict=True):
                 of_parameter.append(self._change(run, frame, nearest, derivative))
-        return compared(
+        alone = compared(
             np.concatenate(distances), [np.concatenate(parts) for parts in changes], self.noise
         )
+        return alone._replace(groups=self._groups())
+
+    def _groups(self) -> NDArray[np.intp]:
+        """Return the numbers of the squares of pictures in which points are: (N,)."""
+        squares = [
+            np.column_stack([np.full(len(points), number), np.asarray(points) // PATCH])
+            for number, points in enumerate(self.outlines)
+        ]
+        groups = np.unique(np.concatenate(squares), axis=0, return_inverse=True)[1]
+        return np.asarray(groups.ravel(), np.intp)
 
     def _change(self, run: ClothRun, frame: int, nearest: "_Nearest", derivative: Floats) -> Floats:
         """Return the derivatives of the distances of a frame: (N,)."""
