@@ -157,9 +157,9 @@ void bind_cloth(nb::module_& m) {
       .def_ro("rounds", &SensitivityReport::rounds, "Rounds of refinement, over all parameters.")
       .def_ro("krylov", &SensitivityReport::krylov)
       .def_ro("unrefined", &SensitivityReport::unrefined,
-              "Steps of a parameter whose last round changed more than is allowed.")
+              "Steps of a parameter that another round would change too much.")
       .def_ro("change", &SensitivityReport::change,
-              "Largest last change over the largest derivative.");
+              "Largest change left to one more round, over the largest derivative.");
   using PairForces = ClothSolver::PairForces;
   nb::class_<PairForces>(m, "PairForces",
                          "Forces of cloth on cloth and surfaces at P pairs of closest points.")

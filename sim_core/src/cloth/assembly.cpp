@@ -156,6 +156,17 @@ void Membrane::set_lagged_stretch(const ClothKernel& kernel, const double* x, do
   data_.lag = lag_.data();
 }
 
+bool Membrane::lags() const {
+  if (!data_.lag) return false;
+  constexpr int W = membrane_lanes, strains = 3 * W, numbers = 9 * W;
+  for (int group = 0; group < data_.groups; ++group) {
+    const double* of_group = data_.lag + 1L * numbers * group;
+    if (std::any_of(of_group + strains, of_group + numbers, [](double c) { return c != 0.0; }))
+      return true;
+  }
+  return false;
+}
+
 Assembly::Assembly(const ClothKernel& kernel_in, const ClothMesh& mesh, const Fabrics& fabrics,
                    const std::vector<std::int32_t>& held, int surface_vertices,
                    MatrixApproximation approximation)
@@ -234,6 +245,12 @@ void Assembly::gradient_of(Energy energy, const Buffer<double>& x, Buffer<double
   if (energy != Energy::membrane) {
     kernel.bending(bending_.data(), x.data(), out.data(), nullptr, nullptr);
   }
+}
+
+void Assembly::add_bending_changes(const Buffer<double>& x, const std::vector<const double*>& along,
+                                   const std::vector<double*>& changes) const {
+  kernel.bending_changes(bending_.data(), x.data(), static_cast<int>(along.size()), along.data(),
+                         changes.data());
 }
 
 Bending Assembly::bending_with(const Fabrics& fabrics) const {

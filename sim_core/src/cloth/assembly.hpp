@@ -50,6 +50,7 @@ class Membrane {
 
   const MembraneData& data() const { return data_; }
   void set_lagged_stretch(const ClothKernel& kernel, const double* x, double fraction);
+  bool lags() const;
 
  private:
   Buffer<int> nodes_, slots_, fabric_;
@@ -95,6 +96,10 @@ class Assembly {
   enum class Energy { all, membrane, bending };
   // Sets `out` (nodes, 4) to the gradient of an energy at x, N, and changes nothing else.
   void gradient_of(Energy energy, const Buffer<double>& x, Buffer<double>& out) const;
+  // Adds to `changes` how the gradient of bending at x changes along vectors (nodes, 4), at most
+  // `solve_group` of them.
+  void add_bending_changes(const Buffer<double>& x, const std::vector<const double*>& along,
+                           const std::vector<double*>& changes) const;
   // Sets `out` (nodes, 4) to the derivative of the gradient at x by the logarithm of a factor of a
   // number of all fabrics, N, and changes nothing that can be seen.
   void gradient_by(BendingNumber number, const Buffer<double>& x, Buffer<double>& out);
@@ -103,6 +108,8 @@ class Assembly {
   void set_lagged_stretch(const Buffer<double>& x, double fraction) {
     membrane_.set_lagged_stretch(kernel, x.data(), fraction);
   }
+  // Whether that changes anything: only where the law is not convex there.
+  bool lags() const { return membrane_.lags(); }
   // Inertia and damping [1/s], on top of the fabrics' own, of a step.
   void set_diagonal(const Inertia& inertia, double damping);
   // Mean of a node's block on the diagonal, N/m.

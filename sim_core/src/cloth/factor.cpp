@@ -190,7 +190,8 @@ FactorStorage::FactorStorage(const Pattern& bending, const Pattern& membrane,
   tiles.assign(tile_begin.back() + 64, 0.0f);
   panel.assign(panel_max + 64, 0.0f);
   updates.assign(update_floats + shelf.length + 64, 0.0f);
-  local.assign(local_max + 64, 0.0f);
+  local_floats = local_max + 64;
+  local.assign(solve_group * local_floats, 0.0f);
 }
 
 void FactorStorage::mark_all() { std::fill(due.begin(), due.end(), 1); }
@@ -233,6 +234,7 @@ Factor FactorStorage::view(bool half) {
           panel.data(),
           updates.data(),
           local.data(),
+          local_floats,
           nullptr,
           nullptr};
 }

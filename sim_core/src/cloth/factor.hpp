@@ -32,6 +32,7 @@ struct FactorStorage {
   std::vector<FrontRun> runs;
   std::vector<long> tile_begin, entry_begin, update_begin;
   Buffer<float> tiles, panel, updates, local;
+  long local_floats = 0;  // of one right-hand side in `local`
 
   // Patterns in the numbers of the order of elimination; that of bending holds that of the
   // membrane.

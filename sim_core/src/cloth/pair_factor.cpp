@@ -209,7 +209,7 @@ void PairFactor::order(const Assembly& assembly, const Buffer<double>& x,
   diagonal_.resize(free_nodes);
   added_.resize(6L * free_nodes);
   storage_ = std::make_unique<FactorStorage>(bending_, membrane_, dissection);
-  ordered_.assign(4L * free_nodes + 64, 0.0f);
+  ordered_.assign(solve_group * 4L * free_nodes + 64, 0.0f);
   view_ = storage_->view(false);  // half precision takes 2 to 20 times the iterations in a crumple
   view_.order = order_.data();
   view_.ordered = ordered_.data();

@@ -29,6 +29,12 @@ constexpr long tile_floats(long width, long below) {
 // Krylov vectors that one linear solve may use.
 constexpr int krylov_max = 40;
 
+// Vectors that go through the matrix and the factor at once: their sums fill the registers.
+constexpr int solve_group = 4;
+
+// Directions that linear problems of one matrix share.
+constexpr int directions_max = 96;
+
 // The table of [Wang et al. 2011] ends at this stretch less one.
 constexpr double table_stretch = 1.0 / 6.0;
 
@@ -132,9 +138,19 @@ struct Factor {
   void* tiles;
   float* panel;  // the front that is being made
   float* updates;
-  float* local;      // one front's right-hand side
-  const int* order;  // nodes by their place in a factor of its own order, or null
-  float* ordered;    // a vector in that order
+  float* local;       // one front's right-hand sides, `solve_group` of them
+  long local_floats;  // of each
+  const int* order;   // nodes by their place in a factor of its own order, or null
+  float* ordered;     // `solve_group` vectors in that order
+};
+
+// Directions in which linear problems of one matrix J were solved, for those that follow.
+struct DirectionSpace {
+  int count;          // at most `directions_max`, of which the arrays have room
+  float* directions;  // (directions, nodes, 4): z_k
+  float* images;      // (directions, nodes, 4): w_k, with w_j . M^-1 w_k = 1 where j = k, else 0
+  float* preconditioned;  // (directions, nodes, 4): M^-1 w_k
+  double* triangle;       // (directions k, directions j): J z_k = sum_j triangle_kj images_j
 };
 
 struct ClothKernel {
@@ -145,6 +161,9 @@ struct ClothKernel {
   void (*membrane_lag)(const MembraneData&, const double* x, double fraction, double* lag);
   double (*bending)(const BendingData&, const double* x, double* gradient, float* stiffening,
                     FoldData* folds);
+  // Adds how the gradient changes along `count` vectors, at most `solve_group`.
+  void (*bending_changes)(const BendingData&, const double* x, int count,
+                          const double* const* along, double* const* changes);
   void (*bending_matrix)(const BendingData&, const float* stiffening, float* scalars);
   void (*apply)(const ClothMatrix&, const float* x, float* y);
   // `added`: (nodes, 6), xx xy xz yy yz zz, N/m. A node keeps its own stiffness, and in contact
@@ -153,6 +172,12 @@ struct ClothKernel {
   // Returns the iterations.
   int (*krylov)(const ClothMatrix&, const Factor&, const ContactRows&, const float* b, float* x,
                 float* work, double tolerance);
+  // Solves J x = b for `count` right-hand sides, at most `solve_group`, each until the largest
+  // component of M^-1 r is at most its target, or `tolerance` of that at first, `expected`, or the
+  // space is full. M is the factor's matrix, and r the residual of b. Returns the triangular
+  // solves.
+  int (*recycle)(const ClothMatrix&, const Factor&, const ContactRows&, DirectionSpace&, int count,
+                 float* b, float* x, double tolerance, const double* targets, double* expected);
 };
 
 // One for each instruction set that they are compiled for; kernels/kernel.cpp is the code of all of

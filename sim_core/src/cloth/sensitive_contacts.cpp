@@ -158,12 +158,16 @@ double Sensitivities::mu_by_direction(int node, const NodeContact& contact, cons
 }
 
 // `force_change`: of what the node needs from contact, N per unit.
-void Sensitivities::linearize_node(int parameter, int node, const Step& step,
+void Sensitivities::linearize_node(int parameter, int place, int node, const Step& step,
                                    Vector3d force_change) {
-  NodeContact& contact = nodes_[node];
+  const NodeContact& contact = nodes_[node];
+  Unknown& unknown = unknowns_[parameter];
+  const auto expect_event = [&](double change) {
+    unknown.nearest_event = std::min(unknown.nearest_event, change);
+  };
   const State& state = states_[parameter];
   const DriveRates& rates = rates_of(parameter, step);
-  const Vector3d d = at_node(derivative_, node), d0 = at_node(state.x, node);
+  const Vector3d d = at_node(unknown.derivative, node), d0 = at_node(state.x, node);
   const Vector3d p = at_node(step.x, node), before = at_node(step.start, node);
   // Motion of the body under the node by the parameter, and of the place from where the body
   // carried the node.
@@ -184,8 +188,8 @@ void Sensitivities::linearize_node(int parameter, int node, const Step& step,
              end.rotation * (begin.rotation.transpose() * rate_at(begin, at_begin, before));
     });
   }
-  auto force = at_node(force_, node);
-  auto correction = at_node(correction_, node);
+  auto force = at_node(force_, place * assembly_.numbering.free_nodes + node);
+  auto correction = at_node(unknown.correction, node);
   // What an opposite body presses changes with the distance of the two faces.
   double pressed_change = 0.0;
   if (contact.on.opposite >= 0) {
@@ -203,9 +207,9 @@ void Sensitivities::linearize_node(int parameter, int node, const Step& step,
   if (contact.mode == contact_open) {
     force = -force_change.cast<float>();
     correction.setZero();
-    contact.event = contact.on.body >= 0 ? event_at(contact.on.gap.distance,
-                                                    contact.on.gap.normal.dot(d - body_motion))
-                                         : infinite;
+    if (contact.on.body >= 0) {
+      expect_event(event_at(contact.on.gap.distance, contact.on.gap.normal.dot(d - body_motion)));
+    }
     return;
   }
   const Vector3d& n = contact.normal;
@@ -224,11 +228,10 @@ void Sensitivities::linearize_node(int parameter, int node, const Step& step,
     const Vector3d friction_change =
         in_plane(force_change - normal_change * n - pressing * change.normal, n);
     const double size = friction.norm();
-    contact.event = std::min(
-        event_at(pressing, normal_change),
-        event_at(mu * load - size,
-                 own_rate * load + mu * load_change -
-                     (size > 0.0 ? friction.dot(friction_change) / size : friction_change.norm())));
+    expect_event(event_at(pressing, normal_change));
+    expect_event(event_at(mu * load - size, own_rate * load + mu * load_change -
+                                                (size > 0.0 ? friction.dot(friction_change) / size
+                                                            : friction_change.norm())));
     return;
   }
   const Vector3d& t = contact.direction;
@@ -245,14 +248,8 @@ void Sensitivities::linearize_node(int parameter, int node, const Step& step,
   lacking += contact.turn_stiffness * across;
   force = -lacking.cast<float>();
   correction = -(change.gap * n).cast<float>();
-  contact.event = std::min(event_at(pressing, normal_change), event_at(length, slip_change.dot(t)));
-}
-
-double Sensitivities::nearest_event_of_contacts() const {
-  double nearest = infinite;
-  for (const NodeContact& contact : nodes_) nearest = std::min(nearest, contact.event);
-  for (const PairContact& contact : pairs_) nearest = std::min(nearest, contact.event);
-  return nearest;
+  expect_event(event_at(pressing, normal_change));
+  expect_event(event_at(length, slip_change.dot(t)));
 }
 
 }  // namespace sim_core

@@ -20,6 +20,12 @@ inline double event_at(double margin, double rate) {
   return rate != 0.0 ? std::abs(margin / rate) : infinite;
 }
 
+inline double largest_of(const Buffer<double>& vectors) {
+  double out = 0.0;
+  for (double component : vectors) out = std::max(out, std::abs(component));
+  return out;
+}
+
 inline Eigen::Vector3d in_plane(const Eigen::Vector3d& vector, const Eigen::Vector3d& normal) {
   return vector - vector.dot(normal) * normal;
 }

@@ -18,8 +18,9 @@
 // (friction_turns.hpp) are taken for constants.
 //
 // The linear problem is that of Newton's method with another right-hand side. Its matrix is of
-// single precision and not exact, so the equations above are refined in double precision until d
-// changes no more [Wilkinson 1963, ch. 3].
+// single precision and not exact, so the equations above are refined in double precision until
+// another round would hardly change d [Wilkinson 1963, ch. 3]. Parameters are solved for together,
+// and each solve uses the directions of those before it in the step (kernels/recycling.hpp).
 #pragma once
 
 #include <array>
@@ -99,9 +100,9 @@ struct DriveRates {
 struct SensitivityReport {
   long steps = 0;       // of all parameters together
   long rounds = 0;      // of refinement
-  long krylov = 0;      // iterations of GMRES
-  long unrefined = 0;   // steps in which the last round changed more than `refined`
-  double change = 0.0;  // largest last change over the largest derivative
+  long krylov = 0;      // triangular solves
+  long unrefined = 0;   // steps in which another round would change more than is allowed
+  double change = 0.0;  // largest such change that is expected, over the largest derivative
 };
 
 class Sensitivities {
@@ -161,8 +162,6 @@ class Sensitivities {
     double normal_force = 0.0, bearing_force = 0.0;  // N: R_N, and that of both sides
     FrictionCoefficient friction;
     double turn_stiffness = 0.0;  // N/m
-    // The change of the parameter by which it changes its branch, to first order.
-    double event = 0.0;
   };
 
   // The branch of a pair that bears a force.
@@ -173,10 +172,27 @@ class Sensitivities {
     Eigen::Matrix<double, 3, 2> along_now, along_start;
     Eigen::Vector3d direction, way;
     double turn_stiffness = 0.0, softening = 1.0, distance = 0.0;
-    double event = 0.0;                                    // as of a node
+  };
+
+  // What a pair has by one parameter.
+  struct PairChange {
     Eigen::Vector3d change = Eigen::Vector3d::Zero();      // of the force, N per unit
     Eigen::Vector3d update = Eigen::Vector3d::Zero();      // of that, by a round
     Eigen::Vector3d right_side = Eigen::Vector3d::Zero();  // N per unit
+  };
+
+  // The linear problem of a step by one parameter.
+  struct Unknown {
+    Buffer<double> derivative;        // d
+    Buffer<double> by_parameter;      // of R, with all positions and velocities as they are
+    Buffer<double> stiffness_change;  // of the energies' gradient by d, N per unit
+    Buffer<float> correction;         // what contact prescribes of the next change of d
+    std::vector<PairChange> pairs;
+    Acceleration acceleration;
+    double nearest_event = 0.0;
+    // Largest component of d, of its change by the last round, and of what the next one is expected
+    // to change, m per unit.
+    double size = 0.0, change = 0.0, expected = 0.0;
   };
 
   // How a node's normal, gap and coefficient of friction change as it moves over what it touches.
@@ -198,21 +214,24 @@ class Sensitivities {
   double friction_rate(int parameter, const Pair& pair) const;
   static PairMotions motions_of(const Pair& pair, const Buffer<double>& vectors);
 
-  void solve(int parameter, const Step& step);
+  void solve(int first, int count, const Step& step);
+  void begin_solve(int parameter, const Step& step);
   void by_parameter(int parameter, const Step& step);
   void differentiate_by(const SensitivityTerm& term, const Step& step);
-  void predict(const State& state, const DriveRates& rates, const Step& step);
-  void differentiate_gradient(const State& state, const Step& step);
-  void linearize(int parameter, const Step& step);
+  void predict(const State& state, const DriveRates& rates, const Step& step,
+               Buffer<double>& derivative) const;
+  void differentiate_gradients(const std::vector<int>& parameters, const Step& step);
+  void differentiate_stretching(int parameter, const Step& step);
+  void linearize(int parameter, int place, const Step& step);
   void linearize_pairs(int parameter);
-  void linearize_node(int parameter, int node, const Step& step, Eigen::Vector3d force_change);
+  void linearize_node(int parameter, int place, int node, const Step& step,
+                      Eigen::Vector3d force_change);
   const Factor& factor_for(const Step& step);
-  void subtract_corrections(const ClothMatrix& matrix);
-  double refine(const Step& step);
-  void find_pair_updates();
-  void take_update();
-  double nearest_event_of_contacts() const;
-  void update_history(State& state, const Step& step);
+  void subtract_corrections(const ClothMatrix& matrix, const Unknown& unknown, int place);
+  void refine(const std::vector<int>& parameters, const Step& step);
+  void find_pair_updates(Unknown& unknown, int place);
+  void take_update(Unknown& unknown, int place);
+  void update_history(int parameter, const Step& step);
   Eigen::Vector3d origin_of(const State& state, int node, const Step& step) const;
   Eigen::Vector3d target_of(const State& state, int node, const Eigen::Vector3d& gravity,
                             const Step& step) const;
@@ -233,13 +252,17 @@ class Sensitivities {
   std::unique_ptr<PairFactor> spare_pair_factor_;
 
   std::vector<int> mode_;
-  Buffer<float> normal_, direction_, coupling_, turn_stiffness_, force_, correction_, solution_,
-      image_, work_;
-  Buffer<double> derivative_;  // d
-  Acceleration acceleration_;
-  Buffer<double> by_parameter_, by_term_, stiffness_change_, pulled_, plus_, minus_, at_, at_start_;
+  Buffer<float> normal_, direction_, coupling_, turn_stiffness_, image_;
+  Buffer<float> force_, solution_;  // of `solve_group` parameters
+  std::vector<Unknown> unknowns_;   // by parameter
+  // Directions in which the linear problems of a step were solved.
+  DirectionSpace space_{};
+  Buffer<float> directions_, images_, preconditioned_;
+  Buffer<double> triangle_;
+  Buffer<double> by_term_, pulled_, plus_, minus_, at_, at_start_;
   const DriveRates no_rates_;
-  int bodies_ = 0;  // in the step at hand
+  int bodies_ = 0;     // in the step at hand
+  bool lags_ = false;  // whether stretching does in the step at hand
 };
 
 }  // namespace sim_core

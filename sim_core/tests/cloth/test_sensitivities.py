@@ -18,6 +18,7 @@ from stickslip_sim_core.cloth.fabrics import Fabric, fabric
 from stickslip_sim_core.cloth.presets import preset_named
 from stickslip_sim_core.cloth.sensitivities import (
     DriveRates,
+    FabricProperty,
     Parameter,
     drive,
     fabric_factor,
@@ -250,6 +251,33 @@ def test_positions_have_the_same_bits() -> None:
     case = CASES["friction of a rod that turns"]
     plain = case.run(0.0, follow=False)
     assert np.array_equal(plain.positions, case.run(0.0, follow=True).positions)
+
+
+def test_parameters_solved_together_are_those_solved_alone() -> None:
+    # Five are more than go through the factor at once.
+    names: list[FabricProperty] = [
+        "density",
+        "stretching",
+        "bending",
+        "bending_warp",
+        "bending_twist",
+    ]
+    parameters = [fabric_factor(name) for name in names]
+
+    def swung(by: list[Parameter]) -> Floats:
+        mesh = meshes.grid(0.1, 0.04, 10, 4)
+        held = np.flatnonzero(mesh.rest[:, 0] < mesh.rest[:, 0].min() + 0.011)
+        cloth = Cloth(mesh, fabric("gray-interlock"), TIGHT, held=held)
+        start = np.column_stack([mesh.rest, np.zeros(len(mesh.rest))])
+        cloth.set_state(start)
+        cloth.follow(by)
+        for _ in range(20):
+            cloth.step(STEP, held=start[cloth.held])
+        return cloth.sensitivities
+
+    for together, parameter in zip(swung(parameters), parameters, strict=True):
+        alone = swung([parameter])[0]
+        assert np.linalg.norm(together - alone) < 1e-5 * np.linalg.norm(alone)
 
 
 def test_derivatives_between_the_ends_of_a_step() -> None:

@@ -20,7 +20,7 @@ from stickslip_sim_core.scenes.holders import Hands, Holder
 from stickslip_sim_core.scenes.kind import Record
 
 UNSOLVED = 1e-2
-"""Relative change in the last round of solving a step from which on derivatives are lost."""
+"""Relative change left to one more round of solving a step from which on derivatives are lost."""
 
 ONE_SIDED = 1e-4
 """Change of a parameter, over its size, within which an event makes a frame one-sided."""

@@ -167,6 +167,68 @@ double bending(const BendingData& data, const double* x, double* gradient, float
   return energy;
 }
 
+// Adds how the gradient changes along each of `count` vectors, at most `solve_group`. With
+// r = A G' r(s) and u = A G' q r' h^2 the gradient is r m + u n, and its change
+//
+//     r dm + u dn + dr m + du n,   dq = 2 m:dH,   ds = 2 h^2 n:dH.
+void bending_changes(const BendingData& data, const double* x, int count,
+                     const double* const* along, double* const* changes) {
+  for (int t = 0; t < data.triangles; ++t) {
+    const double* d = data.rigidity + 6L * data.fabric[t];
+    const int begin = data.begin[t], end = data.begin[t + 1];
+    const auto curvatures = [&](const double* at, NodeD(&h)[3]) {
+      for (int i = begin; i < end; ++i) {
+        const NodeD p = *reinterpret_cast<const NodeD*>(at + 4L * data.nodes[i]);
+        for (int k = 0; k < 3; ++k) h[k] += spread(data.weights[4L * i + k]) * p;
+      }
+    };
+    const auto moments = [&](const NodeD(&h)[3], NodeD(&m)[3]) {
+      m[0] = spread(d[0]) * h[0] + spread(d[1]) * h[1] + spread(d[2]) * h[2];
+      m[1] = spread(d[1]) * h[0] + spread(d[3]) * h[1] + spread(d[4]) * h[2];
+      m[2] = spread(d[2]) * h[0] + spread(d[4]) * h[1] + spread(d[5]) * h[2];
+    };
+    NodeD h[3] = {}, m[3];
+    curvatures(x, h);
+    moments(h, m);
+    const double q = dot3(m[0], h[0]) + dot3(m[1], h[1]) + dot3(m[2], h[2]);
+    const double size2 = data.spacing2[t], area = data.area[t];
+    const double s = size2 * (dot3(h[0], h[0]) + dot3(h[1], h[1]) + 0.5 * dot3(h[2], h[2]));
+    const Stiffening fold = stiffening_of(s);
+    const SofteningData& fabric = data.softening[data.fabric[t]];
+    double soft = 1.0, softer = 0.0;  // G' and G''
+    if (fabric.curvature > 0.0) {
+      const Softened softened = softened_of(fabric, fold.ratio * q);
+      soft = softened.slope;
+      softer = softened.curvature;
+    }
+    const double r = area * soft * fold.ratio, u = area * soft * q * fold.slope * size2;
+    for (int p = 0; p < count; ++p) {
+      NodeD dh[3] = {}, dm[3];
+      curvatures(along[p], dh);
+      moments(dh, dm);
+      const double dq = 2.0 * (dot3(m[0], dh[0]) + dot3(m[1], dh[1]) + dot3(m[2], dh[2]));
+      const double ds =
+          2.0 * size2 * (dot3(h[0], dh[0]) + dot3(h[1], dh[1]) + 0.5 * dot3(h[2], dh[2]));
+      const double d_soft = softer * (fold.slope * ds * q + fold.ratio * dq);
+      const double dr = area * (soft * fold.slope * ds + d_soft * fold.ratio);
+      const double du =
+          area * size2 *
+          (soft * (dq * fold.slope + q * fold.curvature * ds) + d_soft * q * fold.slope);
+      NodeD force[3];
+      for (int k = 0; k < 3; ++k) {
+        const double share = k < 2 ? 1.0 : 0.5;  // of N
+        force[k] = spread(r) * dm[k] + spread(dr) * m[k] + spread(share * u) * dh[k] +
+                   spread(share * du) * h[k];
+      }
+      for (int i = begin; i < end; ++i) {
+        const double* w = data.weights + 4L * i;
+        *reinterpret_cast<NodeD*>(changes[p] + 4L * data.nodes[i]) +=
+            spread(w[0]) * force[0] + spread(w[1]) * force[1] + spread(w[2]) * force[2];
+      }
+    }
+  }
+}
+
 void bending_matrix(const BendingData& data, const float* stiffening, float* scalars) {
   for (int t = 0; t < data.triangles; ++t) {
     const double* d = data.rigidity + 6L * data.fabric[t];

@@ -6,10 +6,12 @@
 #include "cloth/kernels/bending.hpp"
 #include "cloth/kernels/krylov.hpp"
 #include "cloth/kernels/membrane.hpp"
+#include "cloth/kernels/recycling.hpp"
 
 namespace sim_core {
 
-constinit const ClothKernel CLOTH_KERNEL = {KERNEL_LEVEL,   membrane, membrane_lag, bending,
-                                            bending_matrix, apply,    factor,       krylov};
+constinit const ClothKernel CLOTH_KERNEL = {KERNEL_LEVEL,    membrane,       membrane_lag, bending,
+                                            bending_changes, bending_matrix, apply,        factor,
+                                            krylov,          recycle};
 
 }  // namespace sim_core

@@ -95,11 +95,10 @@ inline void admit(const ContactRows& contact, int nodes, float* v) {
   }
 }
 
-// y = J v for an admissible v: a slipping node's friction follows its normal force and turns with
-// its motion.
-inline void apply_contact(const ClothMatrix& matrix, const ContactRows& contact, const float* v,
-                          float* y) {
-  apply_rows(matrix, contact.mode, v, y);
+// Makes y = K v that of J for an admissible v: a slipping node's friction follows its normal force
+// and turns with its motion.
+inline void follow_friction(const ClothMatrix& matrix, const ContactRows& contact, const float* v,
+                            float* y) {
   for (int i = 0; i < matrix.nodes; ++i) {
     Node* at = reinterpret_cast<Node*>(y) + i;
     if (contact.mode[i] == contact_stick) {
@@ -114,6 +113,13 @@ inline void apply_contact(const ClothMatrix& matrix, const ContactRows& contact,
              spread(contact.coupling[i] * normal) * t;
     }
   }
+}
+
+// y = J v for an admissible v.
+inline void apply_contact(const ClothMatrix& matrix, const ContactRows& contact, const float* v,
+                          float* y) {
+  apply_rows(matrix, contact.mode, v, y);
+  follow_friction(matrix, contact, v, y);
 }
 
 inline double product(const float* a, const float* b, long count) {

@@ -163,6 +163,4 @@ def derivative_arrays(
             f"largest derivative of a coordinate by {name} [m per {unit}]; 0 if it has no effect",
         )
     yield array("unrefined_steps", "steps whose derivatives are not solved to 1e-5", "int32")
-    yield array(
-        "refinement_change", "largest change in the last round of solving derivatives, relative"
-    )
+    yield array("refinement_change", "largest change left to one more round of solving, relative")
