@@ -1,5 +1,7 @@
 """The bound on the error of friction: small where cloth slides, and large where cells catch."""
 
+import math
+
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike
@@ -82,9 +84,11 @@ class TestEdges:
         assert friction_error(state) > 1.5 * LIMIT
         code, reason = checks.failed(checks.values(state), state)
         assert code == "friction_error"
+        finer = math.sqrt(friction_error(state) / LIMIT)
         assert reason.endswith(
             "bodies.block is too sharp for the cells of the cloth: give it edges with a radius of "
-            "5 mm, a mesh a thickness of 10 mm, or the cloth finer cells"
+            "5 mm, or a mesh a thickness of 10 mm; if it is round already, make its radius larger, "
+            f"or the cells smaller, by a factor of {math.ceil(20.0 * finer) / 20.0:.3g}"
         )
 
     def test_a_calm_body_does_not_hide_a_sharp_one(self) -> None:

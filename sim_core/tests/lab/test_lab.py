@@ -11,6 +11,7 @@ from stickslip_sim_core.lab.drape import (
     PEDESTAL_RADIUS,
     count_folds,
     drape,
+    refined,
     shadow_beyond_pedestal,
 )
 from stickslip_sim_core.lab.picture import drape_svg
@@ -68,6 +69,26 @@ def test_a_stiff_disc_drapes_less_than_a_soft_one() -> None:
     # A plate of this rigidity hardly bends over 6 cm.
     assert stiff > 97.0
     assert stiff > middle > soft > 20.0
+
+
+@pytest.mark.physics
+def test_a_refined_drape_has_the_folds_of_the_coarser_one() -> None:
+    cloth = isotropic(0.2, 500.0, 5e-5)
+    coarse, other = (drape(cloth, cell=0.015, seed=seed) for seed in (1, 2))
+    draped = drape(cloth, cell=0.0075, seed=2, coarser=coarse)
+    assert draped.at_rest
+    assert draped.unconverged == 0
+    # The bumps of its own seed would have chosen others.
+    assert draped.folds == coarse.folds != other.folds
+    assert draped.coefficient == pytest.approx(coarse.coefficient, abs=2.0)
+
+
+def test_a_refined_drape_begins_on_the_coarser_one() -> None:
+    coarse = drape(isotropic(0.2, 500.0, 1e-2), cell=0.02)
+    middles = coarse.flat[coarse.triangles].mean(axis=1)
+    expected = coarse.positions[coarse.triangles].mean(axis=1)
+    np.testing.assert_allclose(refined(coarse, middles), expected, atol=1e-12)
+    np.testing.assert_allclose(refined(coarse, coarse.flat), coarse.positions, atol=1e-12)
 
 
 def test_a_draped_disc_has_a_picture() -> None:

@@ -8,6 +8,7 @@ No judged value depends on what follows its worst moment: each is a largest valu
 of the worst stretch of steps (`history.worst_stretch`). A calm end therefore mends no run.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -27,6 +28,9 @@ the side of a cell.
 Below it rounding alone would be judged: a sheet that begins 0.9 um inside a floor, and lies there,
 has a flow of two rounding errors.
 """
+
+FRICTION_ERROR = 0.03
+"""Largest relative error of friction that a sample may have."""
 
 
 @dataclass(frozen=True)
@@ -176,7 +180,7 @@ CHECKS = (
         "corrected for cells, and, on bodies, the correction itself as far as weight presses or "
         "the face is round both ways; and a^2/8 elsewhere and over radii below 0.7 cells",
         lambda seen: max(_friction_errors(seen.cloth), default=0.0),
-        0.03,
+        FRICTION_ERROR,
         "18 strips pulled over box edges and creases of meshes of 0.25 to 2 cells, mu 0.1 to 0.6: "
         "at most 0.013 where mu is right within 2 %, at least 0.053 where it is 5 % off or more, "
         "and 0.24 to 0.93 where cells catch",
@@ -233,9 +237,12 @@ def _sharpest(seen: Seen) -> str:
     other = int(np.argmax(errors))
     name = seen.others[other] if seen.others else f"number {other} of bodies, surfaces and sheets"
     radius = 1e3 * seen.cloth.mesh.spacing
+    # The error grows with the square of the angle of a cell, or faster.
+    ratio = math.ceil(20.0 * math.sqrt(errors[other] / FRICTION_ERROR)) / 20.0
     return (
         f"{name} is too sharp for the cells of the cloth: give it edges with a radius of "
-        f"{radius:.3g} mm, a mesh a thickness of {2.0 * radius:.3g} mm, or the cloth finer cells"
+        f"{radius:.3g} mm, or a mesh a thickness of {2.0 * radius:.3g} mm; if it is round already, "
+        f"make its radius larger, or the cells smaller, by a factor of {ratio:.3g}"
     )
 
 

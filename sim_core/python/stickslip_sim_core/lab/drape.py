@@ -16,7 +16,7 @@ from stickslip_sim_core.cloth import meshes
 from stickslip_sim_core.cloth.fabrics import Fabric
 from stickslip_sim_core.cloth.presets import preset_named
 from stickslip_sim_core.cloth.solver import Cloth
-from stickslip_sim_core.lab.settling import settle
+from stickslip_sim_core.lab.settling import STEADY_STEPS, settle
 
 DISC_RADIUS = 0.15
 """R [m]."""
@@ -55,6 +55,9 @@ class Drape:
     unconverged: int
     """Steps that stopped short of the tolerance."""
 
+    flat: Floats
+    """Vertices of the flat ring: (V, 2) [m]."""
+
     positions: Floats
     """Vertices of the ring at rest: (V, 3) [m], the pedestal's plane is z = 0."""
 
@@ -62,14 +65,25 @@ class Drape:
     """Triangles of the ring: (T, 3)."""
 
 
-def drape(fabric: Fabric, *, cell: float = CELL, seed: int = 0, preset: str = "fast") -> Drape:
+def drape(
+    fabric: Fabric,
+    *,
+    cell: float = CELL,
+    seed: int = 0,
+    preset: str = "fast",
+    coarser: Drape | None = None,
+) -> Drape:
     """Drape a disc of a fabric.
+
+    The folds that form are a matter of chance: bumps and meshes decide on them. With `coarser` the
+    disc begins with the folds of another drape, so that the two differ by their cells alone.
 
     Args:
         fabric: The fabric, whose warp runs along x.
         cell: Distance of vertices [m], from 1 to 20 mm.
         seed: Seed of the mesh and of the bumps in which the disc starts.
         preset: Solver settings, by name.
+        coarser: The same fabric, draped with larger cells.
 
     Raises:
         ValueError: The cell is out of its range, or there is no such preset.
@@ -81,11 +95,15 @@ def drape(fabric: Fabric, *, cell: float = CELL, seed: int = 0, preset: str = "f
     radius = np.hypot(*ring.mesh.rest.T)
     held = np.flatnonzero(radius < ring.clamped)
     start = np.column_stack([ring.mesh.rest, _bumps(radius, seed)])
-    start[held, 2] = 0.0
+    if coarser is not None:
+        start = refined(coarser, ring.mesh.rest)
+    start[held] = np.column_stack([ring.mesh.rest[held], np.zeros(len(held))])
 
     cloth = Cloth(ring.mesh, fabric, preset_named(preset), held=held)
     cloth.set_state(start)
-    at_rest = settle(cloth, start[held], rest=REST)
+    # Cloth that has its folds needs no short steps, in which it would choose them.
+    steady_steps = STEADY_STEPS if coarser is None else 0
+    at_rest = settle(cloth, start[held], rest=REST, steady_steps=steady_steps)
 
     positions = cloth.positions
     rim = ring.mesh.rim
@@ -100,6 +118,7 @@ def drape(fabric: Fabric, *, cell: float = CELL, seed: int = 0, preset: str = "f
         cell=cell,
         at_rest=at_rest,
         unconverged=cloth.total.unconverged,
+        flat=ring.mesh.rest,
         positions=positions,
         triangles=ring.mesh.triangles,
     )
@@ -109,6 +128,25 @@ def _bumps(radius: Floats, seed: int) -> Floats:
     """Return heights at the start (V,) [m], which grow from the pedestal outwards."""
     bumps = np.random.default_rng(seed).uniform(-UNEVENNESS, UNEVENNESS, len(radius))
     return np.asarray(bumps * np.clip((radius - PEDESTAL_RADIUS) / DISC_RADIUS, 0.0, None))
+
+
+def refined(coarser: Drape, points: Floats) -> Floats:
+    """Return the places at rest of points of the flat ring (N, 2) on a coarser drape (N, 3) [m]."""
+    a, b, c = np.moveaxis(coarser.flat[coarser.triangles], 1, 0)
+    u, v = b - a, c - a
+    area = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
+    places = np.empty((len(points), 3))
+    for number, point in enumerate(points):
+        d = point - a
+        # Barycentric coordinates in all triangles.
+        s = (d[:, 0] * v[:, 1] - d[:, 1] * v[:, 0]) / area
+        t = (u[:, 0] * d[:, 1] - u[:, 1] * d[:, 0]) / area
+        weights = np.column_stack([1.0 - s - t, s, t])
+        # The circles of a finer ring go beyond the polygons of a coarser one by less than a cell:
+        # the triangle that is nearest by this measure is extended.
+        nearest = int(np.argmax(weights.min(axis=1)))
+        places[number] = weights[nearest] @ coarser.positions[coarser.triangles[nearest]]
+    return places
 
 
 def shadow_beyond_pedestal(positions: Floats, triangles: NDArray[np.int32]) -> float:
