@@ -15,8 +15,9 @@ fitted until the outline is explained.
 
 A fit finds mu, bending and stretching of the mean fabric with mesh 21. How a fabric shears moves mu
 by as much as 0.08, and no parameter sets it: the fit is carried over to fabrics of other kinds, and
-they are weighed by what they leave. With the true fabric mesh 21 reads mu 0.02 to 0.07 too low, so
-the fit of the best kind is also carried over to mesh 41.
+they are weighed by what they leave. With the true fabric mesh 21 reads mu 0.02 to 0.07 too low in
+two films, and 0.01 to 0.02 too high in a third, so the fit of the best kind is also carried over to
+mesh 41.
 
 DIR keeps films and fits, so a second call continues where the first one stopped. It needs
 .venv-blender (`make setup`). The settings were chosen on films of seed 7, but for the fact that
