@@ -104,8 +104,8 @@ def main() -> None:
     print("|---|---|---|---|")
     for name, preset in presets.items():
         path, _ = swung(preset, args.cells)
-        kept = 100.0 * amplitude_of(path) / amplitude_of(reference)
-        print(f"| {name} | {kept:.1f} % | {error_of(path, reference):.2f} | {costs[name]:.3f} |")
+        share = 100.0 * amplitude_of(path) / amplitude_of(reference)
+        print(f"| {name} | {share:.1f} % | {error_of(path, reference):.2f} | {costs[name]:.3f} |")
     ratio = costs["equally exact"] / costs["fine, first order"]
     print(
         f"second order with a step error of {1e3 * (equal.step_error or 0.0):.2g} mm costs", end=" "
