@@ -47,7 +47,8 @@ def test_gradient_and_products_are_those_of_the_jacobian_of_a_fit(
         .differentiated(NAMES)
         .run()
     )
-    residual, J = observed.compare(run, [run.sensitivities[name].positions for name in NAMES])
+    compared = observed.compare(run, [run.sensitivities[name].positions for name in NAMES])
+    residual, J = compared.residual, compared.jacobian
 
     def residual_of(values: Tensor) -> Tensor:
         positions = simulated(lambda at: positions_of(drags, at), values)[list(FRAMES)]

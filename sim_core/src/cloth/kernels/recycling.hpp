@@ -26,6 +26,15 @@ inline float largest_of(const float* v, long floats) {
   return out;
 }
 
+// Divides a vector by its largest component, which it returns: squares of a derivative that
+// consists of rounding alone would be too small for single precision. A vector of zeros stays.
+inline double scale_to_one(float* v, long floats) {
+  const float largest = largest_of(v, floats);
+  if (!(largest > 0.0f)) return 1.0;
+  for (long i = 0; i < floats; ++i) v[i] /= largest;
+  return largest;
+}
+
 // Makes the images after the space's `count` first ones orthonormal in the norm of the factor,
 // w . M^-1 w, and drops those that depend on others. Returns how many were not dropped.
 inline int orthonormalise(DirectionSpace& space, int added, long floats) {
@@ -64,14 +73,15 @@ inline int orthonormalise(DirectionSpace& space, int added, long floats) {
   return space.count - before;
 }
 
-// x = sum of directions whose images have these shares.
-inline void combine(const DirectionSpace& space, long floats, double* shares, float* x) {
+// x = unit times the sum of directions whose images have these shares.
+inline void combine(const DirectionSpace& space, long floats, double unit, double* shares,
+                    float* x) {
   for (long i = 0; i < floats; ++i) x[i] = 0.0f;
   for (int k = space.count - 1; k >= 0; --k) {
     const double* column = space.triangle + 1L * k * directions_max;
     const double factor = shares[k] / column[k];
     for (int j = 0; j < k; ++j) shares[j] -= factor * column[j];
-    add_multiple(x, float(factor), space.directions + k * floats, floats);
+    add_multiple(x, float(unit * factor), space.directions + k * floats, floats);
   }
 }
 
@@ -97,6 +107,25 @@ struct Residual {
   bool stagnates() const { return last_image >= 0 && left > stagnant * before; }
 };
 
+// Sets `of` to the residuals above their targets, and returns their number.
+inline int find_unsolved(const Residual* residuals, int count, int* of) {
+  int active = 0;
+  for (int p = 0; p < count; ++p) {
+    if (residuals[p].left > residuals[p].target) of[active++] = p;
+  }
+  return active;
+}
+
+// Sets the directions after the space's `count` first ones to where residuals lead.
+inline void add_directions(DirectionSpace& space, const Residual* residuals, const int* of,
+                           int active, long floats) {
+  for (int a = 0; a < active; ++a) {
+    const Residual& r = residuals[of[a]];
+    const float* lead = r.stagnates() ? space.preconditioned + r.last_image * floats : r.lead;
+    __builtin_memcpy(space.directions + (space.count + a) * floats, lead, sizeof(float) * floats);
+  }
+}
+
 // Generalised conjugate residuals in the norm of the factor M [Saad 2003, ch. 6.9; Parks et al.
 // 2006]: the residuals of all right-hand sides are the least over one space, to which each that is
 // above its target adds a direction in each round.
@@ -108,8 +137,10 @@ int recycle(const ClothMatrix& matrix, const Factor& factor, const ContactRows& 
   Residual residuals[solve_group];
   const float* from[solve_group];
   float* to[solve_group];
+  double units[solve_group];
   for (int p = 0; p < count; ++p) {
     admit(contact, matrix.nodes, b + p * floats);
+    units[p] = scale_to_one(b + p * floats, floats);
     from[p] = b + p * floats;
     to[p] = x + p * floats;
   }
@@ -126,22 +157,19 @@ int recycle(const ClothMatrix& matrix, const Factor& factor, const ContactRows& 
     r.lead = x + p * floats;
     r.b = b + p * floats;
     r.last_image = -1;
-    r.left = expected[p] = largest_of(r.lead, floats);
-    r.target = tolerance * expected[p] > targets[p] ? tolerance * expected[p] : targets[p];
+    r.left = largest_of(r.lead, floats);
+    expected[p] = units[p] * r.left;
+    const double target = targets[p] / units[p];
+    r.target = tolerance * r.left > target ? tolerance * r.left : target;
     r.project(space, 0, floats);
   }
   for (;;) {
-    int active = 0, of[solve_group];
-    for (int p = 0; p < count; ++p) {
-      if (residuals[p].left > residuals[p].target) of[active++] = p;
-    }
+    int of[solve_group];
+    const int active = find_unsolved(residuals, count, of);
     if (active == 0 || space.count + active > directions_max) break;
+    add_directions(space, residuals, of, active, floats);
     for (int a = 0; a < active; ++a) {
-      const Residual& r = residuals[of[a]];
-      float* z = space.directions + (space.count + a) * floats;
-      __builtin_memcpy(z, r.stagnates() ? space.preconditioned + r.last_image * floats : r.lead,
-                       sizeof(float) * floats);
-      from[a] = z;
+      from[a] = space.directions + (space.count + a) * floats;
       to[a] = space.images + (space.count + a) * floats;
     }
     in_groups(active, [&]<int group>(int first) {
@@ -159,7 +187,8 @@ int recycle(const ClothMatrix& matrix, const Factor& factor, const ContactRows& 
       residuals[of[a]].last_image = first + a < space.count ? first + a : space.count - 1;
     for (int p = 0; p < count; ++p) residuals[p].project(space, first, floats);
   }
-  for (int p = 0; p < count; ++p) combine(space, floats, residuals[p].shares, x + p * floats);
+  for (int p = 0; p < count; ++p)
+    combine(space, floats, units[p], residuals[p].shares, x + p * floats);
   return solves;
 }
 

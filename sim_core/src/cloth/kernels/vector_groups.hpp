@@ -61,29 +61,42 @@ inline void forward_block(const Number* tile, float* const* y, int at, int below
   }
 }
 
-// The registers hold the sums of three columns of each vector.
+// Sums of three columns for each vector, which the registers hold.
+template <int count>
+struct ColumnSums {
+  Floats of[3][count];
+
+  void clear() {
+    for (int k = 0; k < 3; ++k) {
+      for (int p = 0; p < count; ++p) of[k][p] = Floats{};
+    }
+  }
+  // Adds the products of the columns of a tile with the rows of each vector.
+  template <class Number, class Rows>
+  void add(const Number* tile, const Rows& rows) {
+    for (int v = 0; v < tile_vectors; ++v) {
+      Floats value[count];
+      for (int p = 0; p < count; ++p) value[p] = wide(rows(p) + CLOTH_FLOATS * v);
+      for (int k = 0; k < 3; ++k) {
+        const Floats column = wide(tile + k * tile_rows + CLOTH_FLOATS * v);
+        for (int p = 0; p < count; ++p) of[k][p] += column * value[p];
+      }
+    }
+  }
+};
+
 template <int width, int count, class Number>
 inline void backward_block(const Number* tile, float* const* y, int at, int below) {
   float z[count][tile_rows] = {};
   const auto multiply = [&](const Number* from, int rows, auto vector, auto result) {
     for (int q = 0; q < width; q += 3) {
-      Floats sum[3][count];
-      for (int k = 0; k < 3; ++k) {
-        for (int p = 0; p < count; ++p) sum[k][p] = Floats{};
-      }
+      ColumnSums<count> sums;
+      sums.clear();
       const Number* part = from + q * tile_rows;
-      for (int i = 0; i < rows; i += tile_rows, part += width * tile_rows) {
-        for (int v = 0; v < tile_vectors; ++v) {
-          Floats value[count];
-          for (int p = 0; p < count; ++p) value[p] = wide(vector(p) + i + CLOTH_FLOATS * v);
-          for (int k = 0; k < 3; ++k) {
-            const Floats column = wide(part + k * tile_rows + CLOTH_FLOATS * v);
-            for (int p = 0; p < count; ++p) sum[k][p] += column * value[p];
-          }
-        }
-      }
+      for (int i = 0; i < rows; i += tile_rows, part += width * tile_rows)
+        sums.add(part, [&](int p) { return vector(p) + i; });
       for (int k = 0; k < 3; ++k) {
-        for (int p = 0; p < count; ++p) result(p, q + k, sum_of(sum[k][p]));
+        for (int p = 0; p < count; ++p) result(p, q + k, sum_of(sums.of[k][p]));
       }
     }
   };
