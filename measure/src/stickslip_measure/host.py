@@ -159,14 +159,23 @@ class ImportWatch(importlib.abc.MetaPathFinder):
             spec = None if find is None else find(name, path, target)
             if spec is None:
                 continue
-            # An adapter often has the name of its simulator, which may not be installed.
-            if spec.has_location and Path(spec.origin).resolve() == self.adapter:
-                raise ModuleNotFoundError(f"No module named {name!r}", name=name)
-            digests = self.sources.addition(spec.origin if spec.has_location else None)
-            if digests:
-                self.tell(digests)
+            if spec.has_location:
+                self.see(name, spec.origin)
             return spec
         return None
+
+    def see(self, name: str, origin: str) -> None:
+        """Name the file of a module, unless it is known.
+
+        Raises:
+            ModuleNotFoundError: The file is the adapter.
+        """
+        # An adapter often has the name of its simulator, which may not be installed.
+        if Path(origin).resolve() == self.adapter:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+        digests = self.sources.addition(origin)
+        if digests:
+            self.tell(digests)
 
 
 class Host:

@@ -138,7 +138,8 @@ class _Walk:
     """Walks to the minimum of other scenes by the derivatives of one run."""
 
     def __init__(self, scenes: Search, compared: Compared, values: Mapping[str, float]) -> None:
-        self._scenes, self._compared, self._begin = scenes, compared, values
+        self._scenes = scenes
+        self._compared = compared
         self._values = dict(values)
         self._residual = self._first = scenes.residual_at(values)
         self._runs = 1
