@@ -155,7 +155,6 @@ void Sensitivities::solve(int first, int count, const Step& step) {
     begin_solve(p, step);
     parameters.push_back(p);
   }
-  if (space_.count + directions_of_round > directions_max) space_.count = 0;
   const int rounds = pairs_.empty() ? rounds_max : rounds_with_pairs_max;
   const double allowed = pairs_.empty() ? refined : unrefined;
   for (int round = 0; round < rounds; ++round) {
